@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,13 +13,13 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, band_columns
 from gyrostab.diagnose.baseline.known_lines import average_in_bands, expect_lines, resonance_density
-from gyrostab.diagnose.baseline.predicted_effects import complex_factors, predict_effect
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import (
     cross_without,
     moves_within_blocks,
     spread_by_gaps,
 )
+from gyrostab.diagnose.predict.windows import complex_factors, predict_effect
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.physics.base import Effect
@@ -52,86 +53,104 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
     SchemaError
         If the recording lacks the channel of an effect.
     """
-    acting = [_act_on_record(effect, model, blocks) for effect in model.effects]
-    # Blocks with anomalous samples are found and left out.
-    described = [active for active in acting if not _has_anomalous_samples(active)]
-    powers = [power for active in described for power in _added_powers(active, blocks)]
-    response = _filter_response(described, blocks)
-    noise = np.einsum(
-        "fn,abn->abf",
-        band_columns(blocks),
-        np.maximum(_expected_squares(described, square, blocks), 0.0),
-    )
-    added = np.zeros(noise.shape)
-    for extra in powers:
-        added += extra.on_axes
-    narrow = [
-        (extra.acting.effect, extra.acting.rows, extra.on_axes)
-        for extra in powers
-        if extra.acting.prediction.line is not None and extra.factor.any()
-    ]
+    axes = [str(axis) for axis in blocks["axis"].values]
+    shape = (len(axes), blocks.sizes["block"], blocks.sizes["band"])
+    mean, random = np.zeros(shape[:2]), _RandomMeans(shape)
+    squares = np.repeat(square[:, None], shape[1], axis=1)
+    added, response = np.zeros(shape), np.ones((shape[0], 1, shape[2]))
+    narrow: list[tuple[Effect, list[int], Array]] = []
+    coherent: list[tuple[NDArray[np.complex128], Array]] = []
+    left_out = []
+    for effect in model.effects:
+        if isinstance(effect, LoggerFilter):  # it runs at the rate of the instrument
+            effect = replace(effect, instrument=float(model.log.get("oversampling", 1)))
+        rows = [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes]
+        of_effect = tuple(axes[row] for row in rows)
+        sizes = partial(effect.expand_to_axes, axes=of_effect)
+        prediction = predict_effect(effect, blocks, of_effect)
+        has_anomalous_samples = bool({*prediction.marks} - {_EVERYWHERE})
+        if has_anomalous_samples or _shows_elsewhere(prediction):
+            left_out.append(effect.name)
+        if has_anomalous_samples:
+            continue  # such blocks are found and left out
+        for name, values in prediction.mean.items():
+            mean[rows] += sizes(name)[:, None] * values
+        for (term, name), values in prediction.level.items():
+            place = NOISE.index(term)
+            squares[rows, :, place] += square[rows, None, place] * sizes(name)[:, None] * values
+        if prediction.response is not None:
+            response[rows] *= band_response(effect, blocks)
+        for factor, density in _added_powers(effect, prediction, rows, blocks):
+            power = np.abs(factor[:, None, None]) ** 2 * density
+            added += power
+            if prediction.coherent:
+                coherent.append((factor, density))
+            if prediction.line is not None and factor.any():
+                narrow.append((effect, rows, power))
+        random.add(prediction, rows, sizes)
+    noise = np.einsum("fn,abn->abf", band_columns(blocks), np.maximum(squares, 0.0))
     spectrum = spread_by_gaps((noise + added) * response, blocks)
-    variables = _shared_cross(powers, response, blocks)
+    variables = _shared_cross(coherent, response, blocks)
     if narrow and "line_power" in blocks:
         variables |= expect_lines(blocks, narrow, response[:, 0])
-    wandering, power = _add_up_wandering(described, blocks)
-    return KnownEffects(
-        mean=_expected_means(described, blocks),
-        spectrum=spectrum,
-        white_share=1.0 - power / spectrum[..., 0] if wandering else np.ones(power.shape),
-        variables=variables | wandering,
-        left_out=[
-            active.effect.name
-            for active in acting
-            if _has_anomalous_samples(active) or _shows_elsewhere(active)
-        ],
-    )
+    white_share = 1.0 - random.power / spectrum[..., 0]
+    return KnownEffects(mean, spectrum, white_share, variables | random.variables(), left_out)
 
 
-class _ActingEffect(NamedTuple):
-    """An effect of a model on a record."""
-
-    effect: Effect
-    rows: list[int]
-    axes: tuple[str, ...]
-    prediction: Prediction
-
-    def sizes(self, name: str) -> Array:
-        """Return a parameter on each of the axes."""
-        return self.effect.expand_to_axes(name, self.axes)
-
-
-class _AddedPower(NamedTuple):
-    """Power added by an effect."""
-
-    acting: _ActingEffect
-    factor: NDArray[np.complex128]  # (axis,)
-    density: Array  # (axis, block, band): for a factor of 1 [degree2 hour-2 Hz-1 per squared unit]
-
-    @property
-    def on_axes(self) -> Array:
-        """Power on each axis, (axis, block, band) [degree2 hour-2 Hz-1]."""
-        return np.asarray(np.abs(self.factor[:, None, None]) ** 2 * self.density)
+def _added_powers(
+    effect: Effect, prediction: Prediction, rows: list[int], blocks: xr.Dataset
+) -> Iterator[tuple[NDArray[np.complex128], Array]]:
+    """Yield the factor on each axis and the density (axis, block, band) of each spectrum."""
+    axes = tuple(str(axis) for axis in blocks["axis"].values[rows])
+    shape = tuple(blocks.sizes[name] for name in ("axis", "block", "band"))
+    for name, values in prediction.spectrum.items():
+        factor, density = np.zeros(shape[0], np.complex128), np.zeros(shape)
+        factor[rows] = complex_factors(effect, name, axes)
+        peak = resonance_density(effect, name, blocks, axes)
+        density[rows] = (
+            values.reshape(*values.shape[:-1], shape[2], -1).mean(axis=-1)
+            if peak is None
+            else average_in_bands(peak, blocks)
+        )
+        yield factor, density
 
 
-def _act_on_record(effect: Effect, model: Model, blocks: xr.Dataset) -> _ActingEffect:
-    """Predict an effect on the axes that it acts on, a filter at the rate of the instrument."""
-    if isinstance(effect, LoggerFilter):
-        effect = replace(effect, instrument=float(model.log.get("oversampling", 1)))
-    axes = [str(axis) for axis in blocks["axis"].values]
-    rows = [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes]
-    axis_names = tuple(axes[row] for row in rows)
-    return _ActingEffect(effect, rows, axis_names, predict_effect(effect, blocks, axis_names))
+class _RandomMeans:
+    """Sums of random means over effects; whatever they add is not white noise of the means."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.shape = shape
+        self.processes: list[tuple[Array, float]] = []  # variance on each axis, correlation time
+        # variance rate of random walks, and power of all in the lowest band
+        self.walk, self.power = np.zeros((2, *shape[:2]))
+
+    def add(self, prediction: Prediction, rows: list[int], sizes: Callable[[str], Array]) -> None:
+        """Add the steady processes of an effect, with its sizes on the axes of these rows."""
+        for name, (time, variance) in prediction.wander.items():
+            if prediction.levels or not _is_steady(time, variance):
+                continue
+            square = np.zeros(self.shape[0])
+            square[rows] = sizes(name) ** 2
+            if np.isinf(time):
+                self.walk += square[:, None] * variance
+            else:
+                self.processes.append((square * variance[0], time))
+            if name in prediction.spectrum:
+                density = np.asarray(prediction.spectrum[name])
+                by_band = density.reshape(-1, *self.shape[1:], density.shape[-1] // self.shape[2])
+                self.power += square[:, None] * by_band[0, :, 0].mean(axis=-1)
+
+    def variables(self) -> dict[str, NDArray[Any]]:
+        """Return the variables of the baseline, if there are any."""
+        squares = np.array([square for square, _ in self.processes]).reshape(-1, self.shape[0]).T
+        if not (squares.any() or self.walk.any()):
+            return {}
+        times = np.array([time for _, time in self.processes])
+        return {"wander_square": squares, "wander_time": times, "wander_walk": self.walk}
 
 
-def _has_anomalous_samples(active: _ActingEffect) -> bool:
-    """Return whether an effect changes sample counts other than by a quantization grid."""
-    return bool({*active.prediction.marks} - {_EVERYWHERE})
-
-
-def _shows_elsewhere(active: _ActingEffect) -> bool:
+def _shows_elsewhere(prediction: Prediction) -> bool:
     """Return whether an effect also shows outside means, powers and cross-spectra."""
-    prediction = active.prediction
     # the variance describes random means of a constant correlation time without steps
     is_steady = not prediction.levels and all(
         _is_steady(*process) for process in prediction.wander.values()
@@ -148,101 +167,22 @@ def _is_steady(time: float, variance: Array) -> bool:
     return bool(np.isinf(time) or np.ptp(variance) == 0.0)
 
 
-def _expected_means(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Array:
-    """Return the rates that effects add, (axis, block) [degree hour-1]."""
-    mean = np.zeros((blocks.sizes["axis"], blocks.sizes["block"]))
-    for active in acting:
-        for name, values in active.prediction.mean.items():
-            mean[active.rows] += active.sizes(name)[:, None] * values
-    return mean
-
-
-def _expected_squares(acting: Sequence[_ActingEffect], square: Array, blocks: xr.Dataset) -> Array:
-    """Return squared noise coefficients including effects, (axis, block, noise)."""
-    level = np.repeat(square[:, None], blocks.sizes["block"], axis=1)
-    for active in acting:
-        for (term, name), values in active.prediction.level.items():
-            axis_square = square[active.rows, None, NOISE.index(term)]
-            change = axis_square * active.sizes(name)[:, None] * values
-            level[active.rows, :, NOISE.index(term)] += change
-    return level
-
-
-def _added_powers(active: _ActingEffect, blocks: xr.Dataset) -> list[_AddedPower]:
-    """Return the powers that an effect adds, one for each of its spectra."""
-    out, bands = [], blocks.sizes["band"]
-    for name, values in active.prediction.spectrum.items():
-        factor = np.zeros(blocks.sizes["axis"], np.complex128)
-        factor[active.rows] = complex_factors(active.effect, name, active.axes)
-        density = np.zeros((factor.size, blocks.sizes["block"], bands))
-        peak = resonance_density(active.effect, name, blocks, active.axes)
-        density[active.rows] = (
-            values.reshape(*values.shape[:-1], bands, -1).mean(axis=-1)
-            if peak is None
-            else average_in_bands(peak, blocks)
-        )
-        out.append(_AddedPower(active, factor, density))
-    return out
-
-
-def _filter_response(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Array:
-    """Return the power response of filters, (axis, 1, band)."""
-    response = np.ones((blocks.sizes["axis"], 1, blocks.sizes["band"]))
-    for active in acting:
-        if active.prediction.response is not None:
-            response[active.rows] *= band_response(active.effect, blocks)
-    return response
-
-
 def _shared_cross(
-    powers: Sequence[_AddedPower], response: Array, blocks: xr.Dataset
+    coherent: Sequence[tuple[NDArray[np.complex128], Array]], response: Array, blocks: xr.Dataset
 ) -> dict[str, NDArray[Any]]:
-    """Return the cross-spectrum of coherent effects after a filter (axis, 1, band), if any."""
+    """Return the cross-spectrum of coherent effects after a filter (axis, 1, band), if any.
+
+    An effect has a factor on each axis, and a density (axis, block, band) for a factor of 1.
+    """
     if "cross" not in blocks:
         return {}
-    pairs = pair_indices(blocks).T
-    shared = np.zeros((len(pairs), blocks.sizes["block"], blocks.sizes["band"]), np.complex128)
-    for power in (power for power in powers if power.acting.prediction.coherent):
-        for number, (row, other_row) in enumerate(pairs):
-            factor_product = power.factor[row] * np.conj(power.factor[other_row])
-            shared[number] += factor_product * np.sqrt(
-                power.density[row] * power.density[other_row]
-            )
-    for number, (row, other_row) in enumerate(pairs):
-        shared[number] *= np.sqrt(response[row] * response[other_row])
+    first, second = pair_indices(blocks)
+    shared = np.zeros(blocks["cross"].shape, np.complex128)
+    for factor, density in coherent:
+        product = factor[first] * np.conj(factor[second])
+        shared += product[:, None, None] * np.sqrt(density[first] * density[second])
+    shared *= np.sqrt(response[first] * response[second])
     return {"cross": spread_by_gaps(shared, blocks, "pair")} if shared.any() else {}
-
-
-def _add_up_wandering(
-    acting: Sequence[_ActingEffect], blocks: xr.Dataset
-) -> tuple[dict[str, NDArray[Any]], Array]:
-    """Return the random means of all effects, if any, and their power in the lowest band.
-
-    They are not white noise of the means, whatever they add to that band (axis, block).
-    """
-    axes, block_count, bands = (blocks.sizes[name] for name in ("axis", "block", "band"))
-    square, time = [], []
-    walk, power = np.zeros((axes, block_count)), np.zeros((axes, block_count))
-    for active in acting:
-        prediction = active.prediction
-        for name, (memory, variance) in prediction.wander.items():
-            if prediction.levels or not _is_steady(memory, variance):
-                continue
-            size = np.zeros(axes)
-            size[active.rows] = active.sizes(name) ** 2
-            if np.isinf(memory):
-                walk += size[:, None] * variance
-            else:
-                square.append(size * variance[0])
-                time.append(memory)
-            if name in prediction.spectrum:
-                density = np.asarray(prediction.spectrum[name])
-                by_band = density.reshape(-1, block_count, bands, density.shape[-1] // bands)
-                power += size[:, None] * by_band[0, :, 0].mean(axis=-1)
-    squares = np.array(square).reshape(-1, axes).T
-    if not (squares.any() or walk.any()):
-        return {}, power
-    return {"wander_square": squares, "wander_time": np.array(time), "wander_walk": walk}, power
 
 
 def expect_known_motion(
