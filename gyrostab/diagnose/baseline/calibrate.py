@@ -22,11 +22,11 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     sum_noise,
     white_variance,
 )
-from gyrostab.diagnose.baseline.filtered_noise import fit_filter_response
 from gyrostab.diagnose.baseline.posterior import (
     Fit,
     Posterior,
     average_blocks,
+    fit_filter_response,
     fit_squares,
     floor_square,
     noise_posterior,
@@ -38,7 +38,7 @@ from gyrostab.diagnose.baseline.quiescent import (
     noise_level_excess,
 )
 from gyrostab.diagnose.evidence.products import mean_products
-from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
+from gyrostab.diagnose.reduce.schema import BASELINE, label_variables, weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import SchemaError
 from gyrostab.noise import TERMS
@@ -63,9 +63,7 @@ def _mean_noise_excess(
     Bands that the noise does not explain in quiescent blocks tell nothing of the noise of a mean.
     Inputs (block, band).
     """
-    usable_shape = np.where(np.isfinite(power) & np.isfinite(shape) & quiet[:, None], shape, 0.0)
-    total = usable_shape.sum(axis=0)
-    ratio = (usable_shape * np.nan_to_num(power / spectrum)).sum(axis=0) / np.maximum(total, 1e-300)
+    ratio, total = weighted_mean(power / spectrum, np.where(quiet[:, None], shape, 0.0))
     explained = ~_is_foreign(ratio, total, settings)
     if explained.sum() >= MIN_BANDS:
         power, shape, spectrum = power[:, explained], shape[:, explained], spectrum[:, explained]

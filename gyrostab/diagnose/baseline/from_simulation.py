@@ -26,7 +26,7 @@ from gyrostab.diagnose.evidence.spectral_lines import (
 )
 from gyrostab.diagnose.predict.linear_model import band_widths, unspread_share
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
-from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
+from gyrostab.diagnose.reduce.schema import BASELINE, label_variables, weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import local_level
 
@@ -55,7 +55,9 @@ def baseline_from_simulation(
     posteriors, level, unexplained = _calibrate_simulation(simulated, chosen, settings)
     squares = [posterior.square for posterior in posteriors]
     plain = sum_noise(noise_powers(simulated), squares) * level[..., None]
-    form, form_shape = _spectral_form(simulated, plain)
+    form, form_shape = weighted_mean(
+        simulated["power"].values / plain, simulated["shape"].values, axis=1
+    )
     # An unexplained band reaches into others.
     is_measured = unexplained.any(axis=1, keepdims=True)
     form, form_shape = np.where(is_measured, form, 1.0), np.where(is_measured, form_shape, np.inf)
@@ -103,7 +105,10 @@ def _calibrate_simulation(
         posteriors = calibrate_axes(explained, chosen, settings)
         plain = sum_noise(columns, [posterior.square for posterior in posteriors])
         level = _level_over_time(explained, plain, settings)
-        form, shape = _spectral_form(explained, plain * level[..., None])
+        expected = plain * level[..., None]
+        form, shape = weighted_mean(
+            explained["power"].values / expected, explained["shape"].values, axis=1
+        )
         off = np.abs(form - 1.0) * np.sqrt(shape)
         is_worst = (off > settings.excess_sigma) & (off == off.max(axis=1, keepdims=True))
         is_enough = unexplained.sum(axis=1, keepdims=True) < unexplained.shape[1] - MIN_BANDS
@@ -125,22 +130,6 @@ def _level_over_time(simulated: xr.Dataset, plain: Array, settings: Settings) ->
     return level
 
 
-def _spectral_form(simulated: xr.Dataset, expected: Array) -> tuple[Array, Array]:
-    """Return powers over expected powers, (axis, band), and the shape of their distribution."""
-    power, shape = (simulated[name].values for name in ("power", "shape"))
-    return _weighted_mean(power / expected, shape)
-
-
-def _weighted_mean(values: NDArray[Any], shape: Array) -> tuple[NDArray[Any], Array]:
-    """Return the mean over the blocks, and the sum of the shapes."""
-    good = np.isfinite(values) & np.isfinite(shape) & (shape > 0.0)
-    weight = np.where(good, shape, 0.0)
-    total = weight.sum(axis=1)
-    return (weight * np.where(good, values, 0.0)).sum(axis=1) / np.where(
-        total > 0.0, total, 1.0
-    ), total
-
-
 def _shared_statistics(
     simulated: xr.Dataset, expected: Array, spectrum: Array, p_value: float
 ) -> dict[str, NDArray[Any]]:
@@ -152,8 +141,8 @@ def _shared_statistics(
         return {}
     cross, shape = (simulated[name].values for name in ("cross", "cross_shape"))
     first, second = pair_indices(simulated)
-    coherency, coherency_shape = _weighted_mean(
-        cross / np.sqrt(expected[first] * expected[second]), shape
+    coherency, coherency_shape = weighted_mean(
+        cross / np.sqrt(expected[first] * expected[second]), shape, axis=1
     )
     has_data = coherency_shape > 0.0
     total = 2.0 * (np.abs(coherency) ** 2 * coherency_shape).sum(axis=1, keepdims=True)

@@ -10,9 +10,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.predicted_effects import complex_factors, predict_effect
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
 from gyrostab.diagnose.predict.linear_model import unspread_share
+from gyrostab.diagnose.predict.windows import complex_factors, predict_effect
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
@@ -113,9 +113,9 @@ def _take_leakage(lines: NDArray[Any]) -> NDArray[Any]:
 
 
 def average_in_bands(density: Array, blocks: xr.Dataset) -> Array:
-    """Average a density over the lines of every band."""
+    """Average a density (..., line) over the lines of every band."""
     edges = band_edges(int(blocks.attrs["block_samples"])) - 1
-    return np.asarray(np.add.reduceat(density, edges[:-1]) / np.diff(edges))
+    return np.asarray(np.add.reduceat(density, edges[:-1], axis=-1) / np.diff(edges))
 
 
 def independent_line_share(density: Array, blocks: xr.Dataset) -> Array:
@@ -123,12 +123,7 @@ def independent_line_share(density: Array, blocks: xr.Dataset) -> Array:
 
     It is below 1 if the density (axis, line) is dominated by some lines.
     """
-    return np.stack(
-        [
-            average_in_bands(axis_density, blocks) ** 2 / average_in_bands(axis_density**2, blocks)
-            for axis_density in density
-        ]
-    )
+    return average_in_bands(density, blocks) ** 2 / average_in_bands(density**2, blocks)
 
 
 def _line_leakage(size: int, apart: float = 0.0) -> tuple[Array, Array, Array]:

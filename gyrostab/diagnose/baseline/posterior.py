@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +11,11 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from gyrostab.diagnose.evidence.products import marginalise, mean_products, scale_columns
-from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.predict.filter_response import band_response
+from gyrostab.diagnose.predict.windows import make_windows
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.regression.nonnegative import solve_nonnegative
+from gyrostab.physics.logger import LoggerFilter
 from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
@@ -152,8 +156,6 @@ def _eliminate_free_sizes(
     """
     weighted = columns.T * weight
     normal, right = weighted @ columns, weighted @ power
-    if not free_columns.shape[1]:
-        return normal, right, np.empty((0, columns.shape[1])), np.empty(0)
     inner = (free_columns.T * weight) @ free_columns + np.diag(precision)
     inner += 1e-9 * np.diag(np.maximum(np.diagonal(inner), 1e-300))
     crossed = weighted @ free_columns
@@ -162,6 +164,49 @@ def _eliminate_free_sizes(
         np.linalg.solve(inner, (free_columns.T * weight) @ power), dtype=np.float64
     )
     return normal - crossed @ to_noise, right - crossed @ to_right, to_noise, to_right
+
+
+def fit_filter_response(
+    blocks: xr.Dataset, fits: Sequence[Fit], *, settings: Settings = DEFAULTS
+) -> Array | None:
+    """Return the response (band,) of the filter that describes the powers of all axes best.
+
+    A low-pass or an average removes most of the noise at high frequencies, and leaves that of the
+    block means. A fit without the filter would take the steep slope for B and K, and the floor of
+    the stopped bands for N.
+
+    All axes pass the one logger: None if the noise terms alone describe some axis better.
+    """
+    responses = [
+        band_response(LoggerFilter.example(**values), blocks)
+        for values in LoggerFilter.example().points(make_windows(blocks, {}))
+    ]
+    behind = [
+        [fit_behind(fit, fit.columns * response[:, None]) for fit in fits] for response in responses
+    ]
+    chosen = choose_filter(behind, settings)
+    is_better = [
+        nats > fit_behind(fit, fit.columns)[0]
+        for fit, (nats, _) in zip(fits, behind[chosen], strict=True)
+    ]
+    return responses[chosen] if all(is_better) else None
+
+
+def fit_behind(fit: Fit, columns: Array) -> tuple[float, float]:
+    """Return the largest log likelihood of powers over noise of these columns, and its Q^2."""
+    square, _, expected = fit_squares(fit._replace(columns=columns))
+    return _log_likelihood(fit, expected), float(square[0])
+
+
+def choose_filter(behind: Sequence[Sequence[tuple[float, float]]], settings: Settings) -> int:
+    """Return the place of the filter with the least Q^2 among those that fit about as well.
+
+    `behind` has the results of `fit_behind` for each filter and axis. Q rises where a low-pass
+    falls, so that one at too low a cutoff fits with much Q.
+    """
+    likelihood, quantization = np.array(behind).sum(axis=1).T
+    is_close = likelihood > likelihood.max() - settings.ambiguous_nats
+    return int(np.where(is_close, quantization, np.inf).argmin())
 
 
 def floor_square(fit: Fit) -> float:

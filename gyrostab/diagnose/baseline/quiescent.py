@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.predict.windows import fill_linearly
 from gyrostab.diagnose.reduce.block_statistics import iso
+from gyrostab.diagnose.reduce.schema import weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError
 from gyrostab.time.grid import stamp_ns
@@ -111,13 +112,11 @@ def noise_level_excess(
 
 def _typical_spectrum(power: Array, shape: Array) -> Array | None:
     """Return the spectrum (band,) of the block with the median level, or None without data."""
-    use = np.where(np.isfinite(power), shape, 0.0)
-    if not (use.sum(axis=0) > 0.0).all():
+    mean, total = weighted_mean(power, shape)
+    if not (total > 0.0).all():
         return None
-    mean = (use * np.nan_to_num(power)).sum(axis=0) / use.sum(axis=0)
-    filled = use.sum(axis=1) > 0.0
-    level = (use * np.nan_to_num(power / mean)).sum(axis=1)[filled] / use.sum(axis=1)[filled]
-    return np.asarray(mean * np.median(level))
+    level, total_of_block = weighted_mean(power / mean, shape, axis=1)
+    return np.asarray(mean * np.median(level[total_of_block > 0.0]))
 
 
 def _drop_noisy_blocks(

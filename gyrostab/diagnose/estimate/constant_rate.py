@@ -8,7 +8,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.predicted_effects import predict_effect
+from gyrostab.diagnose.predict.windows import predict_effect
+from gyrostab.diagnose.reduce.schema import weighted_mean
 from gyrostab.physics.base import Effect
 from gyrostab.physics.logger import RateQuantization
 from gyrostab.units import HOUR
@@ -48,7 +49,7 @@ def constant_rates(
             rate[rows] -= sizes[:, None] * np.atleast_2d(design)
     if turning in axes and "channel_rotation_rate" in blocks:
         rate[axes.index(turning)] -= HOUR * blocks["channel_rotation_rate"].values
-    means = _average_blocks(blocks, rate)
+    means, _ = weighted_mean(rate, blocks["samples"].values, axis=1)
     for row, step in _truncated_rows(axes, effects):
         recorded, variance = _moments_of_axis(blocks, row)
         means[row] += _undo_truncation(recorded, variance, step)[0] - recorded
@@ -70,17 +71,13 @@ def noise_lost_by_truncation(blocks: xr.Dataset, effects: Sequence[Effect]) -> d
     return out
 
 
-def _average_blocks(blocks: xr.Dataset, values: Array) -> Array:
-    """Average values (axis, block) over the samples."""
-    weight = np.where(np.isfinite(values), blocks["samples"].values, 0.0)
-    total = np.maximum(weight.sum(axis=1), 1.0)
-    return np.asarray((weight * np.nan_to_num(values)).sum(axis=1) / total)
-
-
 def _moments_of_axis(blocks: xr.Dataset, row: int) -> tuple[float, float]:
     """Return the mean of the record, and the variance of the samples about their block means."""
-    mean, variance = (_average_blocks(blocks, blocks[name].values) for name in ("mean", "variance"))
-    return float(mean[row]), float(variance[row])
+    mean, variance = (
+        weighted_mean(blocks[name].values[row], blocks["samples"].values[row])[0]
+        for name in ("mean", "variance")
+    )
+    return float(mean), float(variance)
 
 
 def _truncated_rows(axes: tuple[str, ...], effects: Sequence[Effect]) -> list[tuple[int, float]]:

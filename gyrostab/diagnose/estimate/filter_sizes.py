@@ -13,8 +13,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     common_variance,
     separate_share,
 )
-from gyrostab.diagnose.baseline.filtered_noise import choose_filter, fit_behind
-from gyrostab.diagnose.baseline.posterior import Fit
+from gyrostab.diagnose.baseline.posterior import Fit, choose_filter, fit_behind
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, unspread_share

@@ -26,7 +26,6 @@ from gyrostab.diagnose.baseline.posterior import (
     floor_square,
     noise_posterior,
 )
-from gyrostab.diagnose.baseline.predicted_effects import find_drivers, predict_effect
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.identify.identification import (
@@ -37,7 +36,7 @@ from gyrostab.diagnose.identify.identification import (
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, spread_by_gaps
-from gyrostab.diagnose.predict.windows import rebuild_variant
+from gyrostab.diagnose.predict.windows import find_drivers, predict_effect, rebuild_variant
 from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.physics.base import Effect
 
@@ -277,7 +276,11 @@ def _fit_noise(
         return None
     columns = noise_powers(blocks, axis_effects.response)[row]
     common, shape_alone = (values[row] for values in common_variance(blocks))
-    reduced = _reduced_shapes(shape, shape_alone, common)
+    # reduced by the scatter that the bands of a block share
+    block_shape = np.nansum(shape_alone, axis=1)
+    separate = block_shape / (1.0 + common * block_shape)
+    share = np.minimum(separate / np.maximum(np.nansum(shape, axis=1), 1e-300), 1.0)
+    reduced = shape * share[:, None]
     fit = _average_groups(power, reduced, columns, state.weight[row], axis_effects, chosen)
     square, information, _ = fit_squares(fit)
     plain = float(
@@ -294,15 +297,6 @@ def _fit_noise(
     variance = variance * np.maximum(state.weight[row, :, 0] / (columns[:, 0] @ square), 0.1)
     effect_means = np.stack(axis_effects.means, axis=1) if axis_effects.means else None
     return noise_posterior(fit, blocks, row, variance, chosen, effect_means, state.settings)
-
-
-def _reduced_shapes(shape: Array, shape_alone: Array, common: Array) -> Array:
-    """Return the shapes of the powers, reduced by the scatter that the bands of a block share."""
-    block_shape = np.nansum(shape_alone, axis=1)
-    share = (
-        block_shape / (1.0 + common * block_shape) / np.maximum(np.nansum(shape, axis=1), 1e-300)
-    )
-    return np.asarray(shape * np.minimum(share, 1.0)[:, None])
 
 
 def _average_groups(

@@ -10,7 +10,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.windows import make_windows
+from gyrostab.diagnose.predict.windows import (
+    FREQUENCIES_PER_BAND,
+    frequencies_in_bands,
+    make_windows,
+)
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.kernels.spectra.line_levels import local_level
 from gyrostab.physics.base import Effect
@@ -18,7 +22,6 @@ from gyrostab.physics.prediction import Prediction
 from gyrostab.physics.registry import effects
 
 Array = NDArray[np.float64]
-_FREQUENCIES_PER_BAND = 48  # to average a response; design choice
 _SIZE_COUNT = 50  # filter sizes that are tried; limits resolution
 _MIN_PASSED_SHARE = 0.002  # smallest passed share that is tried, besides 0
 _MAX_LINE_RATIO = 3.0  # of the local level; higher lines are cut
@@ -61,15 +64,8 @@ def band_shape_factor(effect: Effect, blocks: xr.Dataset) -> Array:
 def _responses_in_bands(effect: Effect, blocks: xr.Dataset) -> Array:
     """Return the power response (band, frequency)."""
     return _response_at(effect, blocks, frequencies_in_bands(blocks)).reshape(
-        -1, _FREQUENCIES_PER_BAND
+        -1, FREQUENCIES_PER_BAND
     )
-
-
-def frequencies_in_bands(blocks: xr.Dataset) -> Array:
-    """Return equally many evenly spaced frequencies in every band, band after band [Hz]."""
-    low, high = blocks["band_low"].values, blocks["band_high"].values
-    place = (np.arange(_FREQUENCIES_PER_BAND) + 0.5) / _FREQUENCIES_PER_BAND
-    return np.asarray((low[:, None] + (high - low)[:, None] * place).ravel())
 
 
 def _response_at(effect: Effect, blocks: xr.Dataset, frequency: Array) -> Array:

@@ -17,15 +17,18 @@ from gyrostab.diagnose.predict.candidates import (
     Prospect,
     Variant,
 )
-from gyrostab.diagnose.predict.step_times import power_on_times
 from gyrostab.diagnose.reduce.block_statistics import measured
-from gyrostab.physics.base import Effect
+from gyrostab.physics.base import Effect, driver_error
 from gyrostab.physics.prediction import Prediction, Windows
 from gyrostab.physics.registry import effects
 
 Array = NDArray[Any]
+FREQUENCIES_PER_BAND = 48  # to average a response or a narrow peak; design choice
 _SPLINE_KNOTS = 12  # of hat functions over the record; design choice
 _MAX_DESIGN_DIFFERENCE = 1e-3  # of its size, up to which designs are equal; design choice
+_MAX_TIMES = 240  # limits time
+_MAX_STEPS = 20  # largest steps of the means among them: a step one block off does not fit
+_SIDE_BLOCKS = (2, 8, 32)  # blocks on either side that define a step; design choice
 
 
 def channel_units(blocks: xr.Dataset) -> dict[str, str]:
@@ -128,6 +131,47 @@ def predict_exogenous(effect: Effect, windows: Windows) -> Prediction:
     return replace(full, mean=mean)
 
 
+def frequencies_in_bands(blocks: xr.Dataset) -> Array:
+    """Return equally many evenly spaced frequencies in every band, band after band [Hz]."""
+    low, high = blocks["band_low"].values, blocks["band_high"].values
+    place = (np.arange(FREQUENCIES_PER_BAND) + 0.5) / FREQUENCIES_PER_BAND
+    return np.asarray((low[:, None] + (high - low)[:, None] * place).ravel())
+
+
+def find_drivers(effect: Effect) -> dict[str, str]:
+    """Return the names in the log of an effect's channels."""
+    return {role: effect.channel_names()[role] for role in effect.needs()}
+
+
+def predict_effect(
+    effect: Effect, blocks: xr.Dataset, axes: tuple[str, ...], frequency: Array | None = None
+) -> Prediction:
+    """Predict an effect on some axes, with many frequencies in each band for narrow peaks."""
+    drivers = find_drivers(effect)
+    present = list(channel_units(blocks))
+    for role, name in drivers.items():
+        if name not in present:
+            raise driver_error(effect, role, present)
+    return effect.explain(
+        replace(
+            make_windows(blocks, drivers),
+            axes=axes,
+            frequency=frequencies_in_bands(blocks) if frequency is None else frequency,
+        )
+    )
+
+
+def complex_factors(effect: Effect, name: str, axes: tuple[str, ...]) -> NDArray[np.complex128]:
+    """Return the complex factor of a spectrum for each axis: size, direction, phase."""
+    parameters = {parameter.name: parameter for parameter in effect.parameters()}
+    factor = effect.expand_to_axes(name, axes).astype(np.complex128)
+    if "direction" in parameters:
+        factor *= effect.expand_to_axes("direction", axes)
+    if "phase" in parameters and parameters["phase"].many:
+        factor *= np.exp(1j * np.radians(effect.expand_to_axes("phase", axes)))
+    return factor
+
+
 def driver_names(candidate: Candidate) -> dict[str, str]:
     """Return the channels of the log that a candidate follows, by channel of its effect."""
     channels = effects()[candidate.effect].channels
@@ -175,6 +219,73 @@ def distinct_variants(variants: list[Variant]) -> tuple[Variant, ...]:
             known_designs.add(mark)
             distinct.append(variant)
     return tuple(distinct)
+
+
+def power_on_times(windows: Windows) -> Array:
+    """Return the times at which power came back [s]."""
+    return np.asarray(windows.restarts[:, 1] if windows.restarts.size else np.empty(0))
+
+
+def select_step_times(values: Array, windows: Windows) -> list[float]:
+    """Select the times to try among the possible ones.
+
+    All if they are few. Otherwise some at equal intervals, those at which power came back, and
+    those at which the means of an axis step most. Each has the prior probability of the time it
+    represents, so that selecting by the means gives no advantage.
+
+    Parameters
+    ----------
+    values : ndarray
+        Possible times, rising [s].
+
+    Examples
+    --------
+    >>> begin = 20.0 * np.arange(1000)
+    >>> walk = np.random.default_rng(1).standard_normal(1000)
+    >>> walk[617:] += 5.0
+    >>> windows = Windows(begin, begin + 20.0, np.ones(1), 10.0, ("x",), own={"x": walk})
+    >>> tried = select_step_times(begin[1:], windows)
+    >>> len(tried) < 300, 617 * 20.0 in tried
+    (True, True)
+    """
+    if len(values) <= _MAX_TIMES:
+        return [float(instant) for instant in values]
+    every = -(-len(values) // (_MAX_TIMES - 3 * _MAX_STEPS))
+    steps = _largest_steps(windows)
+    near_steps = values[
+        np.abs(values[:, None] - steps).min(axis=1, initial=np.inf)
+        <= 0.5 * (windows.end[0] - windows.begin[0])
+    ]
+    return [
+        float(instant)
+        for instant in np.unique(
+            np.concatenate([values[every // 2 :: every], power_on_times(windows), near_steps])
+        )
+    ]
+
+
+def _largest_steps(windows: Windows) -> Array:
+    """Return the starts of the blocks at which the means of an axis step most [s]."""
+    steps_found: list[tuple[float, float]] = []
+    for values in windows.own.values():
+        if not np.isfinite(values).all():
+            continue
+        total = np.concatenate([[0.0], np.cumsum(values)])
+        for length in _SIDE_BLOCKS:
+            inner = np.arange(length, values.size - length + 1)
+            if inner.size < 2 * length:
+                continue
+            size = np.abs(total[inner + length] - 2.0 * total[inner] + total[inner - length])
+            wide = np.lib.stride_tricks.sliding_window_view(
+                np.pad(size, length), 2 * length + 1
+            ).max(axis=1)
+            usual = max(float(np.median(size)), 1e-300)
+            steps_found += [
+                (float(size[k] / usual), float(windows.begin[inner[k]]))
+                for k in np.flatnonzero(size == wide)
+            ]
+    largest = dict.fromkeys(begin for _, begin in sorted(steps_found, reverse=True))
+    return np.array(list(largest)[:_MAX_STEPS])
 
 
 def weigh_by_time(variants: tuple[Variant, ...], windows: Windows) -> tuple[Variant, ...]:

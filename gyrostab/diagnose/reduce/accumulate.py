@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -66,6 +67,8 @@ class Accumulator:
         self.rows = self.axes + len(self.channels)
         self.pairs = [(a, b) for a, b in combinations(range(self.rows), 2) if a < self.axes]
         self.edges = kernel.band_edges(length)
+        # cross-powers (block, band) of two spectra, with a table of expected powers of masks
+        self.band_powers = partial(kernel.band_powers, edges=self.edges, rate=rate)
         self.weights = kernel.taper(length)
         full = self._read_masks(np.ones((1, length), bool))
         self.full = _Masks(full.expected, full.shape[0], full.neighbours[0])
@@ -190,8 +193,8 @@ class Accumulator:
         masks = [self._read_gaps(present[row], used[row]) for row in range(self.rows)]
         power = np.stack(
             [
-                self._band_powers(spectrum, spectrum, *mask[:2]).real
-                for spectrum, mask in zip(spectra, masks, strict=True)
+                self.band_powers(spectrum, spectrum, table, place).real
+                for spectrum, (place, table, _, _) in zip(spectra, masks, strict=True)
             ]
         )
         power[~used] = np.nan
@@ -206,7 +209,8 @@ class Accumulator:
             joint = present[a] & present[b]
             joint_count = cross_samples[number] = np.count_nonzero(joint, axis=-1)
             enough = joint_count >= self.min_samples
-            cross[number] = self._band_powers(spectra[a], spectra[b], *masks[a][:2])
+            place, table, _, _ = masks[a]
+            cross[number] = self.band_powers(spectra[a], spectra[b], table, place)
             differ = (joint_count != counts[a]) | (joint_count != counts[b])
             differ &= used[a] & used[b]
             if differ.any():
@@ -231,18 +235,6 @@ class Accumulator:
         """Return the tapered spectra (..., line) of blocks (..., sample)."""
         spectra = np.fft.rfft(centred * self.weights, axis=-1)
         return np.asarray(spectra[..., 1 : kernel.ordinates(self.length) + 1])
-
-    def _band_powers(
-        self,
-        spectra: NDArray[np.complex128],
-        other_spectra: NDArray[np.complex128],
-        place: NDArray[np.int64],
-        table: Array,
-    ) -> NDArray[np.complex128]:
-        """Return the cross-powers (block, band), with the expected powers of each mask."""
-        return np.asarray(
-            kernel.band_powers(spectra, other_spectra, table, place, self.edges, self.rate)
-        )
 
     def _read_masks(self, present: NDArray[np.bool_]) -> _Masks:
         """Return what the gaps of blocks (block, sample) do to their powers."""
@@ -299,7 +291,7 @@ class Accumulator:
         expected, shape, _ = self._read_masks(present)
         place = np.arange(len(present))
         cross, *powers = (
-            self._band_powers(*pair, place, expected)
+            self.band_powers(*pair, expected, place)
             for pair in ((first, second), (first, first), (second, second))
         )
         joint = powers[0].real * powers[1].real

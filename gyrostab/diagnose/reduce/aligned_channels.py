@@ -128,22 +128,17 @@ def align_channels(log: xr.Dataset) -> Aligned:
             if isinstance(placed, str):
                 unused[name] = placed
             elif placed is not None:
-                dim = f"time_{name}"
-                log = log.drop_vars([name, dim]).assign(
-                    {name: ("time", placed.values, log[name].attrs)}
+                values, note = placed
+                log = log.drop_vars([name, f"time_{name}"]).assign(
+                    {name: ("time", values, log[name].attrs)}
                 )
-                notes += [placed.note] if placed.note else []
+                notes += [note] if note else []
     with_times = [variable for name in unused for variable in (name, f"time_{name}")]
     return Aligned(log.drop_vars(with_times, errors="ignore"), unused, notes)
 
 
-class _Placed(NamedTuple):
-    values: Any
-    note: str
-
-
-def _place_channel(log: xr.Dataset, name: str) -> _Placed | str | None:
-    """Resample a channel; a string says why it is not used, None that it keeps its stamps."""
+def _place_channel(log: xr.Dataset, name: str) -> tuple[Any, str] | str | None:
+    """Resample a channel, with a note; or say why it is not used; None if it keeps its stamps."""
     clock = _clock_of(log, name)
     rate, start, size = float(log.attrs["sampling_rate_hz"]), first_stamp(log), log.sizes["time"]
     if not clock.size:
@@ -185,7 +180,7 @@ def _place_channel(log: xr.Dataset, name: str) -> _Placed | str | None:
         method = f"each sample has the mean of its values at {1e9 / period:.4g} Hz"
     grid = _Grid(clock, start, rate, max(reach * period, 0.5e9 / rate), choose)
     note = _describe_placement(name, clock, start, rate, period, method)
-    return _Placed(_place_on_grid(log, name, grid, size), note)
+    return _place_on_grid(log, name, grid, size), note
 
 
 def _is_wave_of_rotation(log: xr.Dataset, name: str) -> bool:

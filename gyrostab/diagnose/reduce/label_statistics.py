@@ -18,7 +18,7 @@ from gyrostab.diagnose.reduce.accumulate import (
 from gyrostab.diagnose.reduce.log_blocks import channel_means, numeric_channels
 from gyrostab.diagnose.reduce.outliers import count_outliers, quantization_step, zeros_beyond_chance
 from gyrostab.diagnose.reduce.rotation_orders import HARMONICS
-from gyrostab.diagnose.reduce.schema import COORDINATES, label_variables
+from gyrostab.diagnose.reduce.schema import COORDINATES, label_variables, weighted_mean
 from gyrostab.diagnose.reduce.zero_bin import BINS, bin_widths, empty_zone
 from gyrostab.kernels.regression.smooth import smooth_curve
 from gyrostab.schema import GAP_CAUSES, texts
@@ -126,17 +126,9 @@ def _equal_block_share(
 
     A few noisy blocks carry all the weight of a mean.
     """
-    good = np.isfinite(power) & np.isfinite(shape) & (shape > 0.0)
-    ordinates = np.where(good, shape, 0.0)
-    usable_power = np.where(good, power, 0.0)
-    usual = (ordinates * usable_power).sum(axis=1, keepdims=True) / np.maximum(
-        ordinates.sum(axis=1, keepdims=True), 1e-300
-    )
-    total = np.maximum(ordinates.sum(axis=2), 1e-300)
-    level = (
-        ordinates
-        * np.divide(usable_power, usual, out=np.zeros_like(usable_power), where=usual > 0.0)
-    ).sum(axis=2) / total
+    usual, _ = weighted_mean(power, shape, axis=1)
+    ratio = power / np.where(usual > 0.0, usual, np.inf)[:, None]
+    level, total = weighted_mean(ratio, shape, axis=2)
     out = np.ones((len(power), part_count))
     for part in range(part_count):
         in_part = np.arange(power.shape[1]) * part_count // power.shape[1] == part

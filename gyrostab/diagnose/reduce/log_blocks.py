@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,13 +65,16 @@ def read_batches(log: xr.Dataset, size: int) -> Iterator[BlockBatch]:
 
 def _read_rates(log: xr.Dataset) -> Iterator[Array]:
     """Read rates and channels; the rate from two angles belongs to the time of the first."""
+    import dask
+
     name = signal_name(log)
     axes = log.sizes["axis"]
     signal = log[name].transpose("axis", "time").data
     channels = [log[channel].data for channel in numeric_channels(log)[0]]
     last_angle: Array | None = None
     for low, high in _split_at_chunks(signal, axes + len(channels)):
-        values = _load_rows(signal, channels, low, high)
+        parts = dask.compute(signal[:, low:high], *(channel[low:high] for channel in channels))
+        values = np.concatenate([np.atleast_2d(part) for part in parts], dtype=np.float64)
         if name == "angle":
             extended = (
                 values if last_angle is None else np.concatenate([last_angle, values], axis=1)
@@ -99,18 +102,6 @@ def _split_at_chunks(signal: Any, rows: int) -> Iterator[tuple[int, int]]:
             low = high
     if high > low:
         yield low, high
-
-
-def _load_rows(signal: Any, channels: Sequence[Any], low: int, high: int) -> Array:
-    """Read the signal and the channels of some samples into one array."""
-    import dask
-
-    loaded = dask.compute(signal[:, low:high], *(channel[low:high] for channel in channels))
-    out = np.empty((signal.shape[0] + len(channels), high - low))
-    out[: signal.shape[0]] = loaded[0]
-    for row, channel_values in enumerate(loaded[1:], start=signal.shape[0]):
-        out[row] = channel_values
-    return out
 
 
 def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: bool) -> Array:

@@ -213,3 +213,17 @@ def axis_values(dataset: xr.Dataset, name: str, axis: str | int) -> NDArray[np.f
     """
     row = axis if isinstance(axis, int) else dataset.variables["axis"].values.tolist().index(axis)
     return np.asarray(dataset.variables[name].isel(axis=row).values)
+
+
+def weighted_mean(
+    values: NDArray[Any], weight: NDArray[np.float64], axis: int = 0
+) -> tuple[NDArray[Any], NDArray[np.float64]]:
+    """Average over an axis where value and weight are known, with the sum of the weights.
+
+    The mean is 0 where nothing is known.
+    """
+    good = np.isfinite(values) & np.isfinite(weight) & (weight > 0.0)
+    used = np.where(good, weight, 0.0)
+    total = used.sum(axis=axis)
+    mean = (used * np.where(good, values, 0.0)).sum(axis=axis) / np.where(total > 0.0, total, 1.0)
+    return mean, total

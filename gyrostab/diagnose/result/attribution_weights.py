@@ -15,6 +15,7 @@ from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import drop_changed_tails
 from gyrostab.diagnose.predict.linear_model import pair_rows
+from gyrostab.diagnose.reduce.schema import weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS, find_statistic
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
@@ -79,14 +80,7 @@ def _with_shared_lines(
         return after
     observed, shape = (blocks[name].values for name in ("cross", "cross_shape"))
     expected = after["cross"].values if "cross" in after else np.zeros_like(observed)
-    weight = np.where(np.isfinite(observed) & np.isfinite(shape), shape, 0.0)
-    total = weight.sum(axis=1)
-    mean = np.divide(
-        (np.nan_to_num(observed - expected) * weight).sum(axis=1),
-        total,
-        out=np.zeros(total.shape, complex),
-        where=total > 0.0,
-    )
+    mean, _ = weighted_mean(observed - expected, shape, axis=1)
     reach = 1.0 / float(blocks.attrs["block_s"])
     cross = expected.copy()
     for place in {place for place, _ in lines}:
@@ -166,7 +160,11 @@ def needed_effects(
     weighed = [
         identification
         for identification, components in shown
-        if all(_is_weighed(component, region) for component in components)
+        if all(
+            # a low-pass may be in the noise of the baseline already
+            str(region["view"]) in component.statistic.contained_in and not component.is_filter
+            for component in components
+        )
     ]
     if not weighed or len(shown) < 2:
         return [identification for identification, _ in shown]
@@ -183,11 +181,3 @@ def needed_effects(
         needed = [int(np.argmax([score for score, _ in without]))]
     dropped = [selection for number, selection in enumerate(weighed) if number not in needed]
     return [identification for identification, _ in shown if identification not in dropped]
-
-
-def _is_weighed(component: Component, region: Region) -> bool:
-    """Return whether a statistic contains what a component contributes.
-
-    A low-pass may be in the noise of the baseline already.
-    """
-    return str(region["view"]) in component.statistic.contained_in and not component.is_filter

@@ -8,7 +8,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.identify.identification import Identifications, Selection
+from gyrostab.diagnose.identify.identification import (
+    Identifications,
+    Selection,
+    components_of,
+)
 from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.locate.regions import Region
 from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
@@ -202,16 +206,11 @@ def motion_mismatches(identified: Sequence[Selection], blocks: xr.Dataset) -> li
 
 def _axes_following(axis: str, identified: Sequence[Selection]) -> list[str]:
     """Return the axes that sense the rate of `axis` through their misalignment."""
-    components = [
-        component
-        for identification in identified
-        if identification.effect == "misalignment"
-        for component in identification.components
-    ]
+    misaligned = [selection for selection in identified if selection.effect == "misalignment"]
     return sorted(
         {
             name
-            for component in components
+            for component in components_of(misaligned)
             if axis in (*component.variant.columns, *component.candidate.reference)
             for name in component.row
         }

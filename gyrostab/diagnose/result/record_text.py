@@ -154,8 +154,8 @@ def noise_texts(content: Mapping[str, Any]) -> list[str]:
     baseline, recording = content["baseline"], content["recording"]
     if baseline["source"] != "calibrated" or not baseline["calibrated_on"]:
         return []
-    record_s = _span_seconds(recording["start"], recording["end"])
-    quiet_s = sum(_span_seconds(*span) for span in baseline["calibrated_on"])
+    record_s = span_seconds(recording["start"], recording["end"])
+    quiet_s = sum(span_seconds(*span) for span in baseline["calibrated_on"])
     lines = [f"noise calibrated on {100 * min(quiet_s / record_s, 1.0):.0f} % of the record:"]
     for axis, terms in baseline["noise"].items():
         texts = [
@@ -169,7 +169,8 @@ def noise_texts(content: Mapping[str, Any]) -> list[str]:
     return lines + [f"  {text}" for text in _unequal_noise_texts(baseline["noise"], settings)]
 
 
-def _span_seconds(start: str, end: str) -> float:
+def span_seconds(start: str, end: str) -> float:
+    """Return the length of a stretch between two ISO times [s]."""
     begin, stop = (np.datetime64(text.removesuffix("Z")) for text in (start, end))
     return float((stop - begin) / np.timedelta64(1, "s"))
 

@@ -16,8 +16,12 @@ from gyrostab.diagnose.evidence.sample_counts import hidden_by_grid
 from gyrostab.diagnose.predict.candidates import TIME_PARAMETER, Candidate
 from gyrostab.diagnose.predict.channel_use import MIN_BLOCK_SHARE, missing_channel_reason
 from gyrostab.diagnose.predict.filter_response import with_band_response
-from gyrostab.diagnose.predict.step_times import select_step_times
-from gyrostab.diagnose.predict.windows import channel_units, make_windows, predict_exogenous
+from gyrostab.diagnose.predict.windows import (
+    channel_units,
+    make_windows,
+    predict_exogenous,
+    select_step_times,
+)
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.errors import OptionError

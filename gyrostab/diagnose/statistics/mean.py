@@ -28,8 +28,7 @@ from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State, moves_within_blocks
 from gyrostab.diagnose.predict.search import Trial, collect_evidence
 from gyrostab.diagnose.predict.sizes import mean_mixture
-from gyrostab.diagnose.predict.step_times import power_on_times
-from gyrostab.diagnose.predict.windows import hat_functions
+from gyrostab.diagnose.predict.windows import hat_functions, power_on_times
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, column_choices
 from gyrostab.diagnose.statistics.jump_forms import jump_competitors

@@ -11,7 +11,7 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
-from gyrostab.diagnose.predict.step_times import select_step_times
+from gyrostab.diagnose.predict.windows import select_step_times
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.physics.prediction import Windows
 from tests.support.candidates import select_candidate
