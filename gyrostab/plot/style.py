@@ -333,14 +333,14 @@ def save_png(
         Image.open(drawn).convert("RGB").quantize(colours).save(target, format="PNG", optimize=True)
 
 
-def embedded(figure: Figure, alt: str, caption: str) -> dict[str, str]:
-    """Prepare a figure for a self-contained page: PNG in base 64, short description, caption."""
+def embedded(figure: Figure, name: str, alt: str) -> dict[str, str]:
+    """Prepare a figure for a self-contained page: PNG in base 64, name, short description."""
     buffer = io.BytesIO()
     save_png(figure, buffer)
     return {
         "png": base64.b64encode(buffer.getvalue()).decode("ascii"),
+        "name": name,
         "alt": alt,
-        "caption": caption,
     }
 
 

@@ -30,10 +30,10 @@ _MAX_GAPS = 200
 class Chart:
     """A chart of a page."""
 
-    #: Identifier in the page, heading, and how to read the chart.
+    #: Identifier in the page, heading, and what to add to the caption.
     name: str
     title: str
-    caption: str
+    note: str
     figure: str  # plotly figure as JSON that can stand in a script element
 
 

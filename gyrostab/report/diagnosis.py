@@ -217,35 +217,4 @@ def _make_figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
         "deviations": (plot_deviations(surfaces), "Allan deviation of the whole record"),
         "spectra": (plot_spectra(surfaces), "Power spectrum of the whole record"),
     }
-    return [embedded(*figure, _FIGURE_TEXT[name]) for name, figure in figures.items()]
-
-
-#: How to read each figure.
-_FIGURE_TEXT = {
-    "surfaces": (
-        "Colour is the Allan deviation: how much the rate, averaged over the time on the vertical "
-        "axis, changes from one average to the next. All panels share one colour scale. A red "
-        "frame, numbered as in the table above, is a mismatch between the recording and the "
-        "simulation before. The simulation after includes the named effects and should look like "
-        "the recording."
-    ),
-    "change": (
-        "The recording divided by the simulation: white where they agree, orange where the "
-        "recording is noisier, purple where it is quieter. Pale cells lie inside the 95 % band of "
-        "the simulation. Full colours lie outside it; a few scattered ones are expected by chance. "
-        "Right: what is left with the effects added."
-    ),
-    "means": (
-        "The Allan variance does not show a bias that is constant within a window. Here each dot "
-        "is the mean rate of a short block. The simulation before predicts a constant mean. Red "
-        "bars are the numbered mismatches of the mean rate. Below: channels."
-    ),
-    "deviations": (
-        "Dots are the recording; where they depart from the dashed line, the simulation without "
-        "the effects is wrong. Where both lines coincide, the named effects change nothing."
-    ),
-    "spectra": (
-        "Grey is the recording at full resolution, so that narrow lines show. The lines are the "
-        "simulations, averaged over bands."
-    ),
-}
+    return [embedded(figure, name, alt) for name, (figure, alt) in figures.items()]

@@ -38,15 +38,15 @@ def diagnosis_charts(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[C
 
     `surfaces` and `content` are the contents of ``diagnosis.nc`` and ``diagnosis.json``.
     """
-    draw: dict[str, tuple[str, Callable[..., go.Figure], str]] = {
-        "change": ("Where recording and simulation differ", _draw_change, _CHANGE_TEXT),
-        "means": ("Mean rate over time, and what drives it", _draw_means, _MEANS_TEXT),
-        "deviations": ("Allan deviation of the whole record", _draw_deviations, _DEVIATIONS_TEXT),
-        "spectra": ("Power spectrum of the whole record", _draw_spectra, _SPECTRA_TEXT),
+    draw: dict[str, tuple[str, Callable[..., go.Figure]]] = {
+        "change": ("Where recording and simulation differ", _draw_change),
+        "means": ("Mean rate over time, and what drives it", _draw_means),
+        "deviations": ("Allan deviation of the whole record", _draw_deviations),
+        "spectra": ("Power spectrum of the whole record", _draw_spectra),
     }
     return [
-        Chart(name, title, text, embeddable(function(surfaces, content).to_json()))
-        for name, (title, function, text) in draw.items()
+        Chart(name, title, "", embeddable(function(surfaces, content).to_json()))
+        for name, (title, function) in draw.items()
     ]
 
 
@@ -237,24 +237,3 @@ def _draw_spectra(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure
         )  # fmt: skip
     _add_cases(figure, surfaces, surfaces["frequency"].values, surfaces["density"])
     return figure
-
-
-_CHANGE_TEXT = (
-    "The Allan deviation of the recording divided by that of the simulation, by time and averaging "
-    "time: white where they agree, orange where the recording is noisier, purple where it is "
-    "quieter. Pale cells lie inside the 95 % band of the simulation. Red frames are the numbered "
-    "mismatches."
-)
-_MEANS_TEXT = (
-    "The Allan variance does not show a bias that is constant within a window. Each dot is the "
-    "mean rate of a short block; lines are the simulations with their 95 % bands. Red areas are "
-    "the numbered mismatches of the mean rate. Below: channels."
-)
-_DEVIATIONS_TEXT = (
-    "Points are the recording; where they depart from the dashed line, the simulation without "
-    "the effects is wrong. Click a name to hide it, click it twice to see it alone."
-)
-_SPECTRA_TEXT = (
-    "Thin lines are the recording at full resolution, so that narrow lines show; the highest value "
-    "is drawn where several fall together. The others are the simulations, averaged over bands."
-)

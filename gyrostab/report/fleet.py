@@ -200,13 +200,7 @@ def _describe_term(row: Mapping[Any, Any], term: str, axes: list[str]) -> dict[s
 
 
 def _make_figure(done: pd.DataFrame, axes: list[str]) -> dict[str, str]:
-    return embedded(
-        _plot_noise(done, axes),
-        "N of each run over time",
-        "Each point is the median angle random walk N of one run, at the middle of the run; each "
-        "panel is an axis. The tools with the most runs have a colour each, all others are grey. "
-        "A point far above those of its tool is a run to look at; a trend may be ageing.",
-    )
+    return embedded(_plot_noise(done, axes), "noise", "N of each run over time")
 
 
 @draws_figure

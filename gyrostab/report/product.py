@@ -76,6 +76,7 @@ def write_report(
             "product.html.jinja",
             title="Gyro stability report",
             summary=_summarise_record(product),
+            variance=variance_name(product),
             judgement=judge_product(product),
             findings=_describe_findings(product, table),
             facts=_list_facts(product),
@@ -257,45 +258,4 @@ def _make_figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str,
             for axis in axis_names(product)
         ),
     ]
-    return [
-        embedded(figure, alt, _CAPTIONS[name].replace("Allan", variance))
-        for name, figure, alt in figures
-    ]
-
-
-#: How to read each figure.
-_CAPTIONS = {
-    "signal": (
-        "Each panel shows one gyro axis or channel over time. Each column of a long record is "
-        "drawn from its lowest to its highest sample, so spikes stay visible. Gaps are grey. Look "
-        "for spikes, steps and drift, and whether they coincide with changes of temperature or "
-        "vibration."
-    ),
-    "coefficients": (
-        "A level line means that the noise of the gyro does not change. N is the short-term noise "
-        "that averaging reduces, B the floor that averaging cannot reduce further, K and R the "
-        "slow drift, Q the resolution of the output. Bars or bands are standard errors. An arrow "
-        "that points down is a 95 % upper limit of the true value. In grey windows the coefficient "
-        "is not observable."
-    ),
-    "davar": (
-        "Colour is the Allan deviation: how much the rate, averaged over the time on the vertical "
-        "axis, differs from one average to the next. A stable gyro gives horizontal stripes; a "
-        "stripe that changes colour at short averaging times means more or less noise; at long "
-        "averaging times, more or less drift. Hatched cells have no estimate; dotted cells are "
-        "estimated from incomplete averages near gaps."
-    ),
-    "change": (
-        "The Allan deviation divided by its median over time at each averaging time: white is the "
-        "median, orange is noisier, purple is quieter. Single coloured cells at long averaging "
-        "times are mostly chance, because a window holds few long averages; whole columns or "
-        "patches are rarely chance."
-    ),
-    "adev": (
-        "Points are the Allan deviation of one window near the middle of the record; at each point "
-        "the band holds the true value with 95 % confidence. Dashed lines are the observed noise "
-        "terms, each with its own slope; the legend gives upper limits for the others. The black "
-        "line is the sum of all five terms: where it leaves the band repeatedly, the five terms do "
-        "not describe this gyro."
-    ),
-}
+    return [embedded(figure, name, alt) for name, figure, alt in figures]

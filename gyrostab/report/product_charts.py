@@ -68,8 +68,7 @@ def product_charts(product: xr.Dataset, log: xr.Dataset | None = None) -> list[C
         Chart(
             name,
             title,
-            _CAPTIONS[name].replace("Allan", variance)
-            + _describe_thinning(product, thinned.get(name, product)),
+            _describe_thinning(product, thinned.get(name, product)),
             embeddable(figure.to_json()),
         )
         for name, title, figure in charts
@@ -330,31 +329,3 @@ def _draw_surface(product: xr.Dataset) -> go.Figure:
         hovertemplate=f"%{{x:.4g}} {unit}<br>%{{y:.3g}} s: %{{z:.3g}} deg/h<extra></extra>",
     )
     return figure
-
-
-#: How to read each chart.
-_CAPTIONS = {
-    "record": (
-        "The mean over all windows. Points are measured, lines are the five terms fitted to them; "
-        "they depart from the points if the noise changes during the record. A slope of -1/2 is "
-        "angle random walk, a level part is bias instability, a slope of +1/2 rate random walk."
-    ),
-    "coefficients": (
-        "Points are estimates with their standard errors, open triangles are 95 % upper limits. "
-        "A level line means that the noise does not change. Gaps are grey. Panels share the time "
-        "axis: zoom in one and all follow."
-    ),
-    "map": (
-        "Colour is the Allan deviation of the axis chosen above. Move the pointer over it, or the "
-        "slider, to choose the window of the next chart."
-    ),
-    "window": (
-        "Points are measured; at each point the band holds the true value with 95 % confidence. "
-        "Where the line, the sum of the fitted terms, leaves the band repeatedly, the five terms "
-        "do not describe this gyro."
-    ),
-    "surface": (
-        "Drag to turn, scroll to zoom. A ridge or furrow across all averaging times is an event in "
-        "time; holes are gaps."
-    ),
-}

@@ -124,8 +124,8 @@ def test_coefficients_are_estimates_or_limits_on_one_time_axis():
 def test_a_long_product_is_thinned_and_says_so(tmp_path):
     product = synthetic.product(windows=2500)
     charts = {chart.name: chart for chart in product_charts(product)}
-    assert "One window in 2.5 is drawn." in charts["coefficients"].caption
-    assert "One window in 12.5 is drawn." in charts["map"].caption
+    assert "One window in 2.5 is drawn." in charts["coefficients"].note
+    assert "One window in 12.5 is drawn." in charts["map"].note
     times = _decode_numbers(json.loads(charts["map"].figure)["data"][0]["x"])
     assert times.size == 200
     stamps = product.time.values.astype("M8[ms]").astype(float)
