@@ -30,21 +30,6 @@ from gyrostab.report.diagnosis_charts import diagnosis_charts
 from gyrostab.store.output import new_output
 from gyrostab.wording import value_digits
 
-_VIEW_TEXT = {
-    "davar": "noise over time and averaging time (dynamic Allan variance)",
-    "mean": "mean rate over time",
-    "cross_axis": "covariance between axes",
-    "spectrum": "lines in the spectrum",
-    "distribution": "distribution of the samples",
-    "restart": "change at a restart",
-}
-_SOURCE_TEXT = {
-    "calibrated": "noise calibrated on quiescent stretches of this recording",
-    "model": "the given model",
-    "simulation": "the given simulated log",
-}
-MAX_LISTED_STRETCHES = 6
-
 
 def write_diagnosis_report(
     diagnosis: Diagnosis, path: str | os.PathLike[str], *, overwrite: bool = False
@@ -62,8 +47,7 @@ def write_diagnosis_report(
     check_diagnosis(content)
     rows = [
         {
-            "id": region["id"],
-            "statistic": _VIEW_TEXT[region["view"]],
+            **region,
             "statement": without_chance(region["statement"]),
             "chance": chance_share(region["p_value"]),
         }
@@ -77,10 +61,13 @@ def write_diagnosis_report(
         text = page_text(
             "diagnosis.html.jinja",
             title="Gyro diagnosis",
-            recording=_recording_text(content),
-            verdict=content["verdict"],
+            content=content,
+            file_name=lambda name: Path(name).name,
             summary=summary(content),
-            facts=_fact_rows(content),
+            length=length_text(
+                span_seconds(content["recording"]["start"], content["recording"]["end"])
+            ),
+            noise_texts=[text.strip() for text in noise_texts(content)[1:]],
             effects=cards,
             mismatches=rows,
             unexplained=[
@@ -88,7 +75,6 @@ def write_diagnosis_report(
             ],
             charts=diagnosis_charts(diagnosis.surfaces, content),
             figures=_make_figures(diagnosis),
-            held=content["held_out"],
             limits=sorted(
                 content["not_found"].items(),
                 key=lambda item: (item[1]["upper_limit"] is None, item[0]),
@@ -97,15 +83,11 @@ def write_diagnosis_report(
                 rejection["name"]: rejection_text(rejection["beaten_by"], rejection["nats"])
                 for rejection in content.get("rejected", [])
             },
-            noise=content["baseline"]["noise"],
             laws=LAWS,
             number=_format_number,
             parameter=_format_parameter,
             plain_name=plain_name,
             unit=unit_symbol,
-            level=f"{100.0 * content['false_alarm_level']:g} %",
-            # effects have one half of the level, places the other
-            effect_level=f"{50.0 * content['false_alarm_level']:g} %",
         )
         temporary.write_text(text, encoding="utf-8")
     return Path(path)
@@ -121,55 +103,6 @@ def _format_parameter(entry: Mapping[str, Any], key: str) -> str:
     return _format_number(entry[key], value_digits(entry["value"], entry["stderr"]))
 
 
-def _format_time(text: str) -> str:
-    return text.removesuffix("Z").split(".")[0].replace("T", " ")
-
-
-def _recording_text(content: Mapping[str, Any]) -> str:
-    return ", ".join(Path(name).name for name in content["recording"]["files"]) or "not recorded"
-
-
-def _fact_rows(content: Mapping[str, Any]) -> list[tuple[str, str]]:
-    recording, baseline = content["recording"], content["baseline"]
-    length = span_seconds(recording["start"], recording["end"])
-    stretches = baseline["calibrated_on"]
-    spans = "; ".join(
-        f"{_format_time(first)} to {_format_time(last)}"
-        for first, last in stretches[:MAX_LISTED_STRETCHES]
-    )
-    more = len(stretches) - MAX_LISTED_STRETCHES
-    unused = (f"{item['name']}: {item['reason']}" for item in content.get("unused_channels", ()))
-    expected = " ".join(effect["statement"] for effect in baseline.get("expected", []))
-    facts = [
-        ("Recording", _recording_text(content)),
-        (
-            "Span (UTC)",
-            f"{_format_time(recording['start'])} to {_format_time(recording['end'])}, "
-            f"{length_text(length)}",
-        ),
-        (
-            "Axes, sampling rate",
-            f"{', '.join(recording['axes'])} at {recording['sampling_rate_hz']:g} Hz",
-        ),
-        ("Channels", ", ".join(recording["channels"]) or "none"),
-        ("Channels not used", "; ".join(unused)),
-        ("Missing samples", f"{100.0 * recording['missing_share']:.2g} %"),
-        ("Compared with", _source_text(baseline)),
-        ("Expected effects, with their size here", expected),
-        ("Quiescent stretches (UTC)", spans + (f" and {more} more" if more > 0 else "")),
-        ("Calibrated noise", "; ".join(text.strip() for text in noise_texts(content)[1:])),
-        ("Computing time", f"{content['seconds']:.3g} s"),
-    ]
-    return [(name, text) for name, text in facts if text]
-
-
-def _source_text(baseline: Mapping[str, Any]) -> str:
-    """Describe where the noise of the simulation comes from."""
-    text = _SOURCE_TEXT[baseline["source"]]
-    is_scaled = baseline["source"] == "model" and baseline["calibrated_on"]
-    return f"{text}, noise scaled to quiescent stretches of this recording" if is_scaled else text
-
-
 def _effect_card(
     effect: Mapping[str, Any],
     others: list[Mapping[str, Any]],
@@ -177,21 +110,15 @@ def _effect_card(
     rows: list[dict[str, Any]],
 ) -> dict[str, Any]:
     """Return the card of an effect, and of the others of its family."""
-    evidence, title = effect["held_out_gain"], plain_name(effect["name"])
+    title = plain_name(effect["name"])
     axes = set(effect["axes"]).union(*(other["axes"] for other in others))
     return {
         **effect,
         "title": f"{title[0].upper()}{title[1:]}, {axes_text(effect['axes'])}",
         "family": family_text(effect, others) if others else "",
-        "evidence": (
-            f"{_format_number(evidence['nats'])} ± {_format_number(evidence['stderr'], 2)} nats "
-            f"(threshold {_format_number(evidence['threshold'], 2)})"
-        ),
         "alternatives": [f"{plain_name(name)} ({name})" for name in effect["alternatives"]],
         "probability": probability_text(effect),
         "next": next_measurement(effect["name"], effect["alternatives"]),
-        "nats": max(float(evidence["nats"]), 0.0),
-        "threshold": max(float(evidence["threshold"]), 0.0),
         "mismatches": [
             row
             for row, region in zip(rows, content["mismatches"], strict=True)

@@ -91,17 +91,11 @@ def write_report(
             plotly=plotly,
             gaps=gaps,
             gap_summary=_summarise_gaps(log, gaps) if log is not None and gaps else "",
-            notes=_note_lines(product.attrs.get("notes")),
-            history=_note_lines(product.attrs.get("history")),
+            notes="\n".join(texts(product, "notes")).splitlines(),
+            history="\n".join(texts(product, "history")).splitlines(),
         )
         temporary.write_text(text, encoding="utf-8")
     return Path(path)
-
-
-def _note_lines(value: Any) -> list[str]:
-    if value is None:
-        return []
-    return value.splitlines() if isinstance(value, str) else [str(line) for line in value]
 
 
 def _stamp_text(time: Any) -> str:
