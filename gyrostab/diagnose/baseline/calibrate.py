@@ -328,7 +328,7 @@ def assemble_baseline(
     )
     span = blocks.sizes["block"] * float(blocks.attrs["block_s"])
     densities = np.maximum([posterior.square[1] for posterior in posteriors], floor) * HOUR
-    grids = _coarse_grids(posteriors, densities, span)
+    grid_K, grid_B, grid_weight = np.stack(_coarse_grids(posteriors, densities, span), axis=1)
     common, shape_alone = common_variance(blocks)
     # without R; B and K are those of the block means
     roots = [
@@ -351,10 +351,10 @@ def assemble_baseline(
         "square_stderr": np.stack([posterior.error for posterior in posteriors]),
         "posterior": np.stack([posterior.draws for posterior in posteriors]),
         "posterior_slow": np.stack([posterior.slow for posterior in posteriors]),
-        "grid_K": np.stack([grid[0] for grid in grids]),
-        "grid_B": np.stack([grid[1] for grid in grids]),
-        "grid_prior": np.full((len(grids), grids[0][0].size), -np.log(grids[0][0].size)),
-        "grid_calibrated": np.stack([grid[2] for grid in grids]),
+        "grid_K": grid_K,
+        "grid_B": grid_B,
+        "grid_prior": np.full(grid_K.shape, -np.log(grid_K.shape[1])),
+        "grid_calibrated": grid_weight,
     }
     coordinates = {
         name: blocks[name]

@@ -188,20 +188,12 @@ def refer_to_kept_noise(
 def _kept_posterior(baseline: xr.Dataset, row: int) -> Posterior:
     """Return the posterior of an axis whose noise is kept."""
     axis_baseline = baseline.isel(axis=row)
-    K, B = axis_baseline["grid_K"].values, axis_baseline["grid_B"].values
-    weight = np.exp(axis_baseline["grid_calibrated"].values)
-    draws = axis_baseline["posterior"].values
-    slow = axis_baseline["posterior_slow"].values
-    return Posterior(
-        axis_baseline["square"].values,
-        axis_baseline["square_stderr"].values,
-        K,
-        B,
-        weight / weight.sum(),
-        draws,
-        slow,
-        True,
+    square, error, K, B, draws, slow = (
+        axis_baseline[name].values
+        for name in ("square", "square_stderr", "grid_K", "grid_B", "posterior", "posterior_slow")
     )
+    weight = np.exp(axis_baseline["grid_calibrated"].values)
+    return Posterior(square, error, K, B, weight / weight.sum(), draws, slow, True)
 
 
 def _collect_effects(

@@ -19,7 +19,7 @@ from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score
 from gyrostab.noise import NORMAL_95
 
 #: Fits a baseline to the blocks where its argument, a mask, is true.
-Model = Callable[[NDArray[np.bool_]], xr.Dataset]
+FitBaseline = Callable[[NDArray[np.bool_]], xr.Dataset]
 STRETCH_S = 100.0  # length of a held-out stretch; longer ones would hide a whole event
 MIN_STRETCHES = 36  # in records shorter than an hour the stretches are shorter instead
 FORECAST_FROM_SHARE = 0.7  # share of the record that a forecast begins from
@@ -28,12 +28,12 @@ SHORT_WINDOW_BLOCKS = 5  # length of the middle one of the three windows of the 
 
 def held_out(
     blocks: xr.Dataset,
-    before: Model,
-    after: Model,
+    before: FitBaseline,
+    after: FitBaseline,
     *,
     more_gain: float = 0.0,
-    shown: Model | None = None,
-    forecast: Model | None = None,
+    shown: FitBaseline | None = None,
+    forecast: FitBaseline | None = None,
 ) -> dict[str, float]:
     """Compare two models of a recording on data that they were not fitted to.
 
