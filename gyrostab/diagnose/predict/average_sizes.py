@@ -61,13 +61,13 @@ def average_sizes(
         Point(variant, component_mixture(component, state, variant))
         for variant in _variant_family(component, candidates)
     ]
-    usual = _usual_places(
-        component,
-        [point.variant for point in grid],
-        [point.evidence for point in grid],
-        state.settings.ambiguous_nats,
-    )
-    points = refine_grid(component, state, [grid[place] for place in usual])
+    # the plain variants, unless others are clearly better
+    family = [point.variant for point in grid]
+    plain = [grid[place] for place in plain_places(component.candidate.effect, family)]
+    top = max(point.evidence for point in grid)
+    if any(point.evidence > top - state.settings.ambiguous_nats for point in plain):
+        grid = plain
+    points = refine_grid(component, state, grid)
     family = [point.variant for point in points]
     evidence = np.array([point.evidence for point in points])
     merged = _merge_points(points)
@@ -189,18 +189,6 @@ def plain_places(effect: str, family: Sequence[Variant]) -> list[int]:
         for place, variant in enumerate(family)
         if all(variant.values.get(name, defaults[name]) == defaults[name] for name in tried)
     ]
-
-
-def _usual_places(
-    component: Component, family: Sequence[Variant], evidence: Sequence[float], margin: float
-) -> list[int]:
-    """Return the places of the plain variants, unless others are clearly better."""
-    plain, top = plain_places(component.candidate.effect, family), max(evidence)
-    return (
-        plain
-        if plain and max(evidence[place] for place in plain) > top - margin
-        else list(range(len(family)))
-    )
 
 
 def _places_without_lag(family: Sequence[Variant]) -> list[int]:
