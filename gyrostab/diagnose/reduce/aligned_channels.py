@@ -178,9 +178,9 @@ def _place_channel(log: xr.Dataset, name: str) -> tuple[Any, str] | str | None:
         choose = partial(_average_around, period=1e9 / rate)
         reach = 1.0
         method = f"each sample has the mean of its values at {1e9 / period:.4g} Hz"
-    grid = _Grid(clock, start, rate, max(reach * period, 0.5e9 / rate), choose)
+    reach_ns = max(reach * period, 0.5e9 / rate)
     note = _describe_placement(name, clock, start, rate, period, method)
-    return _place_on_grid(log, name, grid, size), note
+    return _place_on_grid(log, name, clock, reach_ns, choose), note
 
 
 def _is_wave_of_rotation(log: xr.Dataset, name: str) -> bool:
@@ -219,56 +219,41 @@ def _describe_placement(
 # -------------------------------------------------------------------------------- chunk by chunk
 
 
-@dataclass(frozen=True)
-class _Grid:
-    """Samples of the gyro that get the values of a channel."""
+def _place_on_grid(log: xr.Dataset, name: str, clock: _Clock, reach: float, choose: _Choose) -> Any:
+    """Return the samples of a channel on the gyro's grid; lazy, in its chunks, if the log is.
 
-    clock: _Clock  # of the channel
-    start: int  # of the gyro [ns since 1970]
-    rate: float  # of the gyro [Hz]
-    reach: float  # distance of a sample from the values that it needs [ns]
-    choose: _Choose
+    NaN where no value is within reach [ns].
+    """
+    start, rate, size = first_stamp(log), float(log.attrs["sampling_rate_hz"]), log.sizes["time"]
 
-    def find_needed_values(self, low: int, high: int) -> tuple[int, int]:
-        """Return the range of values that the samples need, with one on either side."""
-        first, last = (int(edge) for edge in grid_times(self.start, self.rate, [low, high - 1]))
-        reach = int(self.reach)
-        return max(self.clock.count_before(first - reach) - 1, 0), min(
-            self.clock.count_before(last + reach) + 1, self.clock.size
-        )
-
-    def place_values(self, values: Any, offset: int, low: int, high: int) -> Array:
-        """Return the values at the samples, NaN where no value is within reach."""
+    def place_values(values: Any, offset: int, low: int, high: int) -> Array:
         numbers = np.asarray(values, dtype=np.float64)
-        stamps = self.clock.stamps_between(offset, offset + numbers.size)
+        stamps = clock.stamps_between(offset, offset + numbers.size)
         good = np.isfinite(numbers)
-        numbers, stamps = numbers[good], stamps[good]
-        if not numbers.size:
+        if not good.any():
             return np.full(high - low, np.nan)
-        instants = grid_times(self.start, self.rate, np.arange(low, high))
-        return np.asarray(self.choose(instants, stamps, numbers, self.reach))
+        instants = grid_times(start, rate, np.arange(low, high))
+        return np.asarray(choose(instants, stamps[good], numbers[good], reach))
 
-
-def _place_on_grid(log: xr.Dataset, name: str, grid: _Grid, size: int) -> Any:
-    """Return the samples of a channel on the grid; lazy, in the gyro's chunks, if the log is."""
     signal, data = log[signal_name(log)].transpose("axis", "time").data, log[name].data
     edges = [*range(0, size, _CHUNK_SAMPLES), size]
     if hasattr(signal, "chunks"):
         edges = np.concatenate([[0], np.cumsum(signal.chunks[1])]).tolist()
-    pieces = [(*grid.find_needed_values(low, high), low, high) for low, high in pairwise(edges)]
+    pieces = []
+    for low, high in pairwise(edges):  # the values that the samples need, and one on either side
+        first, last = (int(edge) for edge in grid_times(start, rate, [low, high - 1]))
+        begin = max(clock.count_before(first - int(reach)) - 1, 0)
+        end = min(clock.count_before(last + int(reach)) + 1, clock.size)
+        pieces.append((data[begin:end], begin, low, high))
     if isinstance(signal, np.ndarray) and isinstance(data, np.ndarray):
-        return np.concatenate(
-            [grid.place_values(data[a:b], a, low, high) for a, b, low, high in pieces]
-        )
+        return np.concatenate([place_values(*piece) for piece in pieces])
     import dask
     import dask.array as da
 
-    place_values = dask.delayed(grid.place_values, pure=False)
-    chunks = [
-        da.from_delayed(place_values(data[a:b], a, low, high), (high - low,), dtype=np.float64)
-        for a, b, low, high in pieces
-    ]
-    return da.concatenate(chunks)
+    lazily = dask.delayed(place_values, pure=False)
+    return da.concatenate(
+        [da.from_delayed(lazily(*piece), (piece[3] - piece[2],), np.float64) for piece in pieces]
+    )
 
 
 def _take_nearest(instants: Stamps, stamps: Stamps, values: Array, reach: float) -> Array:
