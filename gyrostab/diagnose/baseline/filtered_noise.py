@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 def fit_filter_response(
     blocks: xr.Dataset, fits: Sequence[Fit], *, settings: Settings = DEFAULTS
 ) -> Array | None:
-    """Return the response (band,) of the filter that describes the powers of all axes best.
+    """Return the response (band, term) of the filter that describes the powers of all axes best.
 
     All axes pass the one logger: None if the noise terms alone describe some axis better.
     """
@@ -33,9 +33,7 @@ def fit_filter_response(
         band_response(LoggerFilter.example(**values), blocks)
         for values in LoggerFilter.example().points(make_windows(blocks, {}))
     ]
-    behind = [
-        [fit_behind(fit, fit.columns * response[:, None]) for fit in fits] for response in responses
-    ]
+    behind = [[fit_behind(fit, fit.columns * response) for fit in fits] for response in responses]
     chosen = choose_filter(behind, settings)
     is_better = [
         nats > fit_behind(fit, fit.columns)[0]

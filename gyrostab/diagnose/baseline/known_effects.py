@@ -57,9 +57,11 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
     described = [active for active in acting if not _has_anomalous_samples(active)]
     powers = [power for active in described for power in _added_powers(active, blocks)]
     response = _filter_response(described, blocks)
+    white_response = response[:, None, :, NOISE.index("N")]
     noise = np.einsum(
-        "fn,abn->abf",
+        "fn,afn,abn->abf",
         band_columns(blocks),
+        response,
         np.maximum(_expected_squares(described, square, blocks), 0.0),
     )
     added = np.zeros(noise.shape)
@@ -70,10 +72,10 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
         for extra in powers
         if extra.acting.prediction.line is not None and extra.factor.any()
     ]
-    spectrum = spread_by_gaps((noise + added) * response, blocks)
-    variables = _shared_cross(powers, response, blocks)
+    spectrum = spread_by_gaps(noise + added * white_response, blocks)
+    variables = _shared_cross(powers, white_response, blocks)
     if narrow and "line_power" in blocks:
-        variables |= expect_lines(blocks, narrow, response[:, 0])
+        variables |= expect_lines(blocks, narrow, white_response[:, 0])
     wandering, power = _add_up_wandering(described, blocks)
     return KnownEffects(
         mean=_expected_means(described, blocks),
@@ -140,7 +142,7 @@ def _shows_elsewhere(active: _ActingEffect) -> bool:
     if elsewhere or prediction.phase_locked or not is_steady:
         return True
     is_shown = prediction.mean or prediction.level or prediction.spectrum
-    return not is_shown and prediction.response is None
+    return not is_shown and not prediction.response
 
 
 def _is_steady(time: float, variance: Array) -> bool:
@@ -186,10 +188,10 @@ def _added_powers(active: _ActingEffect, blocks: xr.Dataset) -> list[_AddedPower
 
 
 def _filter_response(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Array:
-    """Return the power response of filters, (axis, 1, band)."""
-    response = np.ones((blocks.sizes["axis"], 1, blocks.sizes["band"]))
+    """Return the factors of filters on the noise terms, (axis, band, term)."""
+    response = np.ones((blocks.sizes["axis"], blocks.sizes["band"], len(NOISE)))
     for active in acting:
-        if active.prediction.response is not None:
+        if active.prediction.response:
             response[active.rows] *= band_response(active.effect, blocks)
     return response
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from gyrostab.diagnose.baseline.expected_statistics import (
     band_columns,
@@ -25,6 +26,7 @@ from gyrostab.physics.registry import effects
 Array = NDArray[np.float64]
 
 ZOOM_POINTS, ZOOM_STEPS = 21, 4  # of the refinement of a cutoff on its grid
+_CUTOFF_STEP = 0.01  # relative, of the likeliest cutoff; limits resolution
 
 GRID_REACH = 0.25  # distance in ln(cutoff) of one place on the grid of filters
 
@@ -49,7 +51,7 @@ def fit_filter_sizes(
 
     def fit_all(values: Mapping[str, Any]) -> list[tuple[float, float]]:
         response = band_response(kind.example(**values), state.blocks)
-        filtered = band_columns(state.blocks) * response[:, None]
+        filtered = band_columns(state.blocks) * response
         return [fit_behind(fit, mixing @ filtered) for fit, mixing in fits]
 
     def likelihood(values: Mapping[str, Any]) -> float:
@@ -60,6 +62,7 @@ def fit_filter_sizes(
         for variant in components[0].candidate.variants
         if components[0].statistic.is_filter(variant)
     ]
+    family += _best_sizes(family, likelihood)
     behind = [fit_all(values) for values in family]
     log = [sum(nats for nats, _ in axes) for axes in behind]
     best = family[choose_filter(behind, state.settings)]
@@ -87,6 +90,32 @@ def fit_filter_sizes(
             ],
         )
     }, other_values
+
+
+def _best_sizes(
+    family: Sequence[Mapping[str, Any]], likelihood: Callable[[Mapping[str, Any]], float]
+) -> list[dict[str, Any]]:
+    """Return the likeliest cutoff of each kind of low-pass, between its neighbours on the grid.
+
+    A strong filter has a narrower likelihood than the grid is fine.
+    """
+    kinds: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for values in family:
+        if values["cutoff"]:
+            kind = tuple(value for name, value in values.items() if name != "cutoff")
+            kinds.setdefault(kind, []).append(values)
+    out = []
+    for low_passes in kinds.values():
+        best = max(range(len(low_passes)), key=lambda place: likelihood(low_passes[place]))
+        values, cutoff = low_passes[best], [float(each["cutoff"]) for each in low_passes]
+        found = minimize_scalar(
+            lambda cutoff: -likelihood({**values, "cutoff": cutoff}),  # noqa: B023
+            bounds=(cutoff[max(best - 1, 0)], cutoff[min(best + 1, len(cutoff) - 1)]),
+            method="bounded",
+            options={"xatol": _CUTOFF_STEP * cutoff[best]},
+        )
+        out.append({**values, "cutoff": float(found.x)})
+    return out
 
 
 def _refine_on_grid(
