@@ -104,18 +104,18 @@ def _best_sizes(
         if values["cutoff"]:
             kind = tuple(value for name, value in values.items() if name != "cutoff")
             kinds.setdefault(kind, []).append(values)
-    out = []
+    likeliest = []
     for low_passes in kinds.values():
         best = max(range(len(low_passes)), key=lambda place: likelihood(low_passes[place]))
-        values, cutoff = low_passes[best], [float(each["cutoff"]) for each in low_passes]
-        found = minimize_scalar(
+        values, cutoffs = low_passes[best], [float(point["cutoff"]) for point in low_passes]
+        minimum = minimize_scalar(
             lambda cutoff: -likelihood({**values, "cutoff": cutoff}),  # noqa: B023
-            bounds=(cutoff[max(best - 1, 0)], cutoff[min(best + 1, len(cutoff) - 1)]),
+            bounds=(cutoffs[max(best - 1, 0)], cutoffs[min(best + 1, len(cutoffs) - 1)]),
             method="bounded",
-            options={"xatol": _CUTOFF_STEP * cutoff[best]},
+            options={"xatol": _CUTOFF_STEP * cutoffs[best]},
         )
-        out.append({**values, "cutoff": float(found.x)})
-    return out
+        likeliest.append({**values, "cutoff": float(minimum.x)})
+    return likeliest
 
 
 def _refine_on_grid(
