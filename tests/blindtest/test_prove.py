@@ -551,7 +551,7 @@ def test_overwrite_replaces_the_run(small, tmp_path, monkeypatch):
 
 
 def test_folder_is_locked_by_one_run(small, tmp_path):
-    from gyrostab.jobs import lock_job
+    from gyrostab.jobs.job import lock_job
 
     (tmp_path / "proof").mkdir()
     with lock_job(tmp_path / "proof"), pytest.raises(ResumeError):
