@@ -502,8 +502,7 @@ def test_nonnegative_solution_is_optimal():
     for _ in range(50):
         design = rng.standard_normal((12, 5)) * 10.0 ** rng.integers(-6, 6, 5)
         data = rng.standard_normal(12)
-        solution = np.empty(5)
-        solve_nonnegative(design.T @ design, design.T @ data, solution)
+        solution = solve_nonnegative(design.T @ design, design.T @ data)
         expected, residual = nnls(design, data)
         assert np.linalg.norm(design @ solution - data) <= residual * (1 + 1e-6)
         np.testing.assert_allclose(design @ solution, design @ expected, atol=1e-5)
