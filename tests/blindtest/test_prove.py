@@ -459,7 +459,7 @@ def test_a_model_that_cannot_be_checked_is_no_failed_diagnosis(tmp_path, monkeyp
         content: ClassVar = {}
 
     recording = make_log(np.zeros((3, 100)), {}, start=0, rate=10.0)
-    monkeypatch.setattr("gyrostab.jobs.load.load_log", lambda paths: recording)
+    monkeypatch.setattr("gyrostab.jobs.load_log", lambda paths: recording)
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: Found())
     target, failed = tmp_path / "good.json", tmp_path / "failed.txt"
     assert diagnose_case(tmp_path / "0123456789ab.nc", target, failed, 100)
@@ -551,7 +551,7 @@ def test_overwrite_replaces_the_run(small, tmp_path, monkeypatch):
 
 
 def test_folder_is_locked_by_one_run(small, tmp_path):
-    from gyrostab.jobs.job import lock_job
+    from gyrostab.jobs import lock_job
 
     (tmp_path / "proof").mkdir()
     with lock_job(tmp_path / "proof"), pytest.raises(ResumeError):

@@ -126,7 +126,7 @@ def prove(
     from gyrostab.blindtest.scenarios.commitment import open_truth
     from gyrostab.blindtest.scenarios.real import check_recordings
     from gyrostab.blindtest.scoring.table import list_missed, score_table
-    from gyrostab.jobs.job import lock_job
+    from gyrostab.jobs import lock_job
     from gyrostab.progress import no_stage
 
     if workers is not None and workers < 0:

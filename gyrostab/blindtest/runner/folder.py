@@ -18,7 +18,7 @@ from typing import Any
 
 from gyrostab.blindtest.generator.scenario import STREAM_LABELS
 from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError
-from gyrostab.jobs.job import is_lock
+from gyrostab.jobs import is_lock
 from gyrostab.store.output import check_target, is_leftover, read_json, write_text
 
 #: Seeds below this one are for tuning; published runs use others.

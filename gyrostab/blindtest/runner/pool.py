@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from gyrostab.errors import WorkerError
-from gyrostab.jobs.schedule import open_pool, run_calls
+from gyrostab.jobs import open_pool, run_calls
 
 T = TypeVar("T")
 

@@ -52,7 +52,7 @@ def diagnose_case(recording: Path, target: Path, failed: Path, nulls: int) -> bo
     The diagnosis is written with the check of its model, if that has an effect.
     """
     from gyrostab import diagnose
-    from gyrostab.jobs.load import load_log
+    from gyrostab.jobs import load_log
 
     try:
         log = load_log([recording])
@@ -92,7 +92,7 @@ def compare_case(recording: Path, truth: dict[str, Any], target: Path) -> dict[s
         channel_detector,
     )
     from gyrostab.blindtest.scoring.stepwise import stepwise_detector
-    from gyrostab.jobs.load import load_log
+    from gyrostab.jobs import load_log
 
     if target.exists():
         stored: dict[str, float] = json.loads(target.read_text(encoding="utf-8"))
