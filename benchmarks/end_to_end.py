@@ -7,10 +7,9 @@ The files are NetCDF (int32, zstd), Zarr (int32, blosc) and CSV.
 Prints a Markdown table, and puts it into its place in a page. Every figure is the best of some
 runs, each in a separate, warm process: kernels compiled, files in the cache of the system.
 Beside the time on the clock stands the processor time of all threads, which says more where the
-machine has other work to do. A run uses every second difference (``full``, as by default) or those
-that ``--overlap octave`` leaves. The peer reads every sample as a double into memory: xarray, one
-file after the other in as many threads as there are workers, or for CSV pyarrow, as a table. Beside
-it stands the same by gyrostab's own reader, chunk by chunk through dask.
+machine has other work to do. The peer reads every sample as a double into memory: xarray, one file
+after the other in as many threads as there are workers, or for CSV pyarrow, as a table. Beside it
+stands the same by gyrostab's own reader, chunk by chunk through dask.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 
 from make_archive import make_archive
@@ -73,17 +71,15 @@ def compare(form: str, folder: Path, options: argparse.Namespace) -> list[list[s
 
         peer = measure(read_arrow if form == "csv" else read_xarray)
         own = None if form == "csv" else measure(read_own)
-        for terms in ("full", "octave"):
-            run = measure(partial(run_whole, terms))
-            clock, processor = (
-                [f"{timing[i]:.2f}" if timing else "" for timing in (peer, own, run)]
-                for i in range(2)
-            )
-            rows.append([
-                FORMATS[form], f"{hours:g}", str(workers), terms, *clock,
-                f"{samples / run[0]:.1f}", f"{run[0] / peer[0]:.2f}", f"<= {TARGETS[form]:g}",
-                f"{run[0] / own[0]:.2f}" if own else "", *processor, f"{run[1] / peer[1]:.2f}",
-            ])  # fmt: skip
+        run = measure(run_whole)
+        clock, processor = (
+            [f"{timing[i]:.2f}" if timing else "" for timing in (peer, own, run)] for i in range(2)
+        )
+        rows.append([
+            FORMATS[form], f"{hours:g}", str(workers), *clock,
+            f"{samples / run[0]:.1f}", f"{run[0] / peer[0]:.2f}", f"<= {TARGETS[form]:g}",
+            f"{run[0] / own[0]:.2f}" if own else "", *processor, f"{run[1] / peer[1]:.2f}",
+        ])  # fmt: skip
     return rows
 
 
@@ -141,12 +137,12 @@ def read_arrow(files: list[Path], workers: int, repeat: int) -> Timing:
     return best(lambda: [csv.read_csv(file).num_rows for file in files], repeat)
 
 
-def run_whole(terms: str, files: list[Path], workers: int, repeat: int) -> Timing:
-    """Time ``gyrostab run`` with this ``--overlap``, after a first run on the first file."""
+def run_whole(files: list[Path], workers: int, repeat: int) -> Timing:
+    """Time ``gyrostab run``, after a first run on the first file."""
     from gyrostab.cli import main as command
 
     with tempfile.TemporaryDirectory(prefix="gyrostab-io-") as folder:
-        options = f"--window 10min --step 1min --overlap {terms} --workers {workers}".split()
+        options = f"--window 10min --step 1min --workers {workers}".split()
         options += ["-o", f"{folder}/product.nc", "--overwrite", "--quiet-progress"]
 
         def work(names: list[Path]) -> None:

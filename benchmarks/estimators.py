@@ -186,7 +186,7 @@ def fit_gmwm(records: Records) -> Estimates:
     under this fit; that is exact here, where `simts` takes it from simulated records.
     """
     n, (ks, avar) = records.values.shape[1], records.octaves
-    tables = window_fit.fit_tables(tuple(ks.tolist()), (0,) * ks.size, records.rate, n)
+    tables = window_fit.fit_tables(tuple(ks.tolist()), records.rate, n)
     columns, wavelet = tables.columns / 2, avar / 2
     freedom = np.maximum((n - 2 * ks + 1) / (2 * ks), 1.0)
     width = freedom / chi2.ppf(0.025, freedom) - freedom / chi2.ppf(0.975, freedom)
@@ -286,7 +286,7 @@ def compare(seconds: float, rate: float, trials: int, mixtures: tuple[str, ...] 
     """Yield mixture, term, relative bound, and per estimator its figures and processor time."""
     n = int(seconds * rate)
     units, parts = make_units(np.random.default_rng([n, 1]), trials, n, rate)
-    tables = window_fit.fit_tables(*_default_factors(parts[1][:1], rate), rate, n)
+    tables = window_fit.fit_tables(_default_factors(parts[1][:1], rate), rate, n)
     likelihood = Cosines(n, rate)
     for mixture in mixtures:
         squares = choose_squares(tables, mixture)
@@ -304,9 +304,9 @@ def compare(seconds: float, rate: float, trials: int, mixtures: tuple[str, ...] 
             yield mixture or "none", TERMS[a], bound[a] / true[a], own, times
 
 
-def _default_factors(record: Array, rate: float) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def _default_factors(record: Array, rate: float) -> tuple[int, ...]:
     ks = np.round(surface_of(record, rate).tau.values * rate).astype(np.int64)
-    return tuple(ks.tolist()), (0,) * ks.size
+    return tuple(ks.tolist())
 
 
 def summarise(cells: dict[str, list[tuple[str, Array]]], times: dict[str, list[float]]) -> str:

@@ -55,10 +55,9 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
     flat = [np.ascontiguousarray(cell.reshape(-1, ks.size), dtype=np.float64) for cell in cells[:5]]
     trend, *responses, exact = (cell.reshape(-1) for cell in cells[5:])
     trends = [trend, np.stack(responses, axis=-1), exact]
-    shifts = np.zeros_like(ks)
-    tables = window_fit.fit_tables(tuple(ks.tolist()), tuple(shifts.tolist()), rate, window)
+    tables = window_fit.fit_tables(tuple(ks.tolist()), rate, window)
     noise_tables = (tables.columns, tables.weight, tables.to_samples)
-    diagonal = combine_diagonal(*product_tables(window, ks, shifts, diagonal=True))
+    diagonal = combine_diagonal(*product_tables(window, ks, diagonal=True))
     whole = best(lambda: fit_noise(surface), repeats)
     kernel = best(lambda: window_fit.run_kernel(flat, *trends, tables, 31), repeats)
     options = {"white_error": np.zeros(trends[0].size), "allowed": 31, "observed_only": True}
@@ -79,7 +78,7 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
             repeats,
         ),
     ]
-    once = best(lambda: window_fit.FitTables(ks, shifts, rate, window), 1)
+    once = best(lambda: window_fit.FitTables(ks, rate, window), 1)
     return ks.size, [1e6 * s / flat[0].shape[0] for s in seconds] + [once]
 
 

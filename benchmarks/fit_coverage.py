@@ -140,7 +140,7 @@ def main() -> None:
         rng = np.random.default_rng([n, int(10 * share)])
         whole, parts, trends = simulate_units(rng, trials, n, rate, share)
         ks = np.round(whole.tau.values * rate).astype(np.int64)
-        tables = window_fit.fit_tables(tuple(ks.tolist()), (0,) * ks.size, rate, n)
+        tables = window_fit.fit_tables(tuple(ks.tolist()), rate, n)
         for mixture in MIXTURES:
             squares = choose_squares(tables, mixture)
             product = fit_noise(mix(whole, parts, trends, squares), observed_only=False)

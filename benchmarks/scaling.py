@@ -143,13 +143,12 @@ def against_options(folder: Path, given: argparse.Namespace) -> str:
             {"window": window, "step": step}
             for window, step in (("2min", "12s"), ("10min", "1min"), ("1h", "6min"))
         ),
-        {"overlap": "octave"},
     ):
-        windows = {**WINDOW, "overlap": "full", **change}
+        windows = {**WINDOW, **change}
         result = measure(store, windows, given)
         cost = costs(result, AXES * hours * 3600 * RATE)
         rows.append([*windows.values(), f"{result['seconds']:.2f}", *cost])
-    head = ["window", "step", "taus", "overlap", "seconds", *COSTS]
+    head = ["window", "step", "taus", "seconds", *COSTS]
     return f"Log of {hours:g} h.\n\n{table(head, rows)}"
 
 

@@ -17,8 +17,6 @@ def direct_surface(
     window: int,
     step: int,
     ks: list[int],
-    *,
-    shifts: list[int] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Allan variance and number of terms of every window of a rate record, by definition."""
     n_windows = (x.size - window) // step + 1
@@ -35,8 +33,6 @@ def direct_surface(
         for i, k in enumerate(ks):
             d = theta[2 * k :] - 2 * theta[k:-k] + theta[: -2 * k]
             keep = lost[2 * k :] == lost[: -2 * k]
-            if shifts is not None:
-                keep &= (j * step + np.arange(keep.size)) % 2 ** shifts[i] == 0
             count[j, i] = keep.sum()
             if count[j, i]:
                 avar[j, i] = float((d[keep] ** 2).sum() / (2 * np.longdouble(k) ** 2 * count[j, i]))

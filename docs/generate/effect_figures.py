@@ -11,8 +11,9 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+from effect_comparison import plot_comparison
+
 from gyrostab.physics.registry import effects
-from gyrostab.plot import plot_comparison
 from gyrostab.plot.style import save_png
 from gyrostab.simulate import read_model, simulate
 
@@ -40,7 +41,7 @@ def draw(name, folder):
     options = {key: PLAN[name][key] for key in OPTIONS if key in PLAN[name]}
     folder.mkdir(parents=True, exist_ok=True)
     save_png(
-        plot_comparison(*simulate_pair(name), width=193.04, **options),
+        plot_comparison(*simulate_pair(name), **options),
         folder / f"{name}.png",
         dpi=120,
         colours=256,

@@ -17,17 +17,16 @@ def compile_fit() -> None:
     The kernels of `davar` come first, because it is the first to need them.
     """
     window, rate, factors = 1000, 1.0, tuple(2**power for power in range(9))
-    shifts = (0,) * len(factors)
     ones, zero = np.ones((2, len(factors))), np.zeros(2)
     avar = ones / factors
-    tables = tabulate_noise(window, factors, shifts, rate, "avar")
+    tables = tabulate_noise(window, factors, rate, "avar")
     estimate_freedoms(Cells(avar, *[ones] * 8), tables)
     fit_block(
         [avar, ones, ones, ones, ones],
         zero,
         np.ones((2, 4)),
         zero,
-        fit_tables(factors, shifts, rate, window),
+        fit_tables(factors, rate, window),
         white_error=zero,
         allowed=31,
         observed_only=True,

@@ -50,7 +50,6 @@ def davar(
     taus: Any = 40,
     tau_max: Any = None,
     axis: str | Sequence[str] | None = None,
-    overlap: str = "full",
     min_strict: float = 0.3,
     min_coverage: float = 0.1,
     variance: str = "avar",
@@ -84,10 +83,6 @@ def davar(
         Longest averaging time [s]; a third of the window by default (L13), at most half of it.
     axis : str or sequence of str, optional
         Axes to use; all by default.
-    overlap : {"full", "octave"}
-        Use every second difference, or for ``k >= 16`` one in k/16 to k/8 of them, with k rounded
-        to a multiple of a power of two: less work on long windows (1.7 times faster as measured by
-        ``make bench``), with 1 % more scatter.
     min_strict, min_coverage : float
         In a rate log with gaps, the terms inside unbroken runs are used or, where fewer than
         `min_strict` of them are left, weighted cluster means (see ``estimator``); in an angle log,
@@ -138,7 +133,7 @@ def davar(
     """
     log = as_log(log)
     plan = make_plan(
-        log, window=window, step=step, taus=taus, tau_max=tau_max, axis=axis, overlap=overlap,
+        log, window=window, step=step, taus=taus, tau_max=tau_max, axis=axis,
         min_strict=min_strict, min_coverage=min_coverage, variance=variance,
     )  # fmt: skip
     cells, means = run_units(plan.signal.data, plan)

@@ -16,7 +16,7 @@ from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.fit.autocovariance import STOCHASTIC
 from gyrostab.noise import TERMS
 from gyrostab.schema import check_surface
-from gyrostab.time.durations import duration_seconds, thin
+from gyrostab.time.durations import duration_seconds
 from gyrostab.units import HOUR
 
 #: Variables of a surface that a fit uses: by averaging time, and those of the trend by window.
@@ -136,7 +136,6 @@ def prepare_fit(
     """Return the cells of a surface, and tables and positions of the averaging times to fit."""
     cells, ks, rate, window = fit_inputs(surface, allowed)
     chosen = within[thin_factors(ks[within])]
-    shifts = thin(ks[chosen]) if surface.attrs.get("overlap") == "octave" else np.zeros_like(chosen)
     variance = surface.attrs.get("variance", "avar")
-    tables = fit_tables(tuple(ks[chosen].tolist()), tuple(shifts.tolist()), rate, window, variance)
+    tables = fit_tables(tuple(ks[chosen].tolist()), rate, window, variance)
     return cells, tables, chosen

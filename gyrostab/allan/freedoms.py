@@ -50,18 +50,17 @@ class NoiseTables(NamedTuple):
 def make_noise_tables(plan: Plan) -> NoiseTables:
     """Make the tables for the degrees of freedom of a plan."""
     unit = plan.unit
-    factors, thinning = tuple(unit.ks.tolist()), tuple(unit.shifts.tolist())
-    return tabulate_noise(unit.window, factors, thinning, plan.rate, unit.variance)
+    return tabulate_noise(unit.window, tuple(unit.ks.tolist()), plan.rate, unit.variance)
 
 
 @lru_cache(maxsize=4)
 def tabulate_noise(
-    window: int, factors: tuple[int, ...], thinning: tuple[int, ...], rate: float, variance: str
+    window: int, factors: tuple[int, ...], rate: float, variance: str
 ) -> NoiseTables:
     """Make the tables for the degrees of freedom, once for all parts of a log."""
-    ks, shifts = np.array(factors, dtype=np.int64), np.array(thinning, dtype=np.int64)
+    ks = np.array(factors, dtype=np.int64)
     columns = variance_columns(variance, ks, rate)
-    pairs, ramps = product_tables(window, ks, shifts, variance=variance, diagonal=True)
+    pairs, ramps = product_tables(window, ks, variance=variance, diagonal=True)
     weight = white_freedoms(variance, window, ks, pairs)
     diagonal = combine_diagonal(pairs, ramps)
     return NoiseTables(thin_factors(ks), columns, weight, sample_squares(rate), diagonal)

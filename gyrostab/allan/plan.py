@@ -14,7 +14,7 @@ from gyrostab.errors import OptionError
 from gyrostab.kernels.allan.surface import Unit
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.schema import signal_name
-from gyrostab.time.durations import averaging_factors, samples, thin
+from gyrostab.time.durations import averaging_factors, samples
 
 #: Largest number of cells (windows times averaging times) of a unit of work, and of a part of a
 #: surface over all axes.
@@ -23,7 +23,6 @@ MOST_CELLS = 2**20
 WINDOWS_S = (600, 300, 120, 60, 30, 20, 10, 5, 2, 1)
 #: Shortest window [samples].
 MIN_WINDOW_SAMPLES = 4
-_OVERLAPS = ("full", "octave")
 
 
 class Plan(NamedTuple):
@@ -44,16 +43,12 @@ class Plan(NamedTuple):
 
 def make_plan(
     log: xr.Dataset, *, window: Any = None, step: Any = None, taus: Any = 40, tau_max: Any = None,
-    axis: str | Sequence[str] | None = None, overlap: str = "full", min_strict: float = 0.3,
-    min_coverage: float = 0.1, variance: str = "avar",
+    axis: str | Sequence[str] | None = None, min_strict: float = 0.3, min_coverage: float = 0.1,
+    variance: str = "avar",
 ) -> Plan:  # fmt: skip
     """Check the options of `davar` against a log of `gyrostab.ingest.convert.as_log`."""
-    for option, value, choices in (
-        ("overlap", overlap, _OVERLAPS),
-        ("variance", variance, tuple(VARIANCES)),
-    ):
-        if value not in choices:
-            raise OptionError(f"{option}={value!r}: give one of {', '.join(choices)}")
+    if variance not in VARIANCES:
+        raise OptionError(f"variance={variance!r}: give one of {', '.join(VARIANCES)}")
     # with min_strict above 1, all cells are of cluster means
     for option, share, most in (
         ("min_strict", min_strict, np.inf),
@@ -69,38 +64,18 @@ def make_plan(
         choose_window(log) if window is None else window, step, rate, intervals
     )
     order = VARIANCES[variance].order
-    ks = averaging_factors(taus, rate=rate, window=length, tau_max=tau_max, order=order)
-    ks, _ = _thin_terms(ks, overlap)
-    asked, (ks, shifts) = ks, _thin_terms(_fill_octaves(ks), overlap)
-    unit = Unit(
-        length,
-        hop,
-        ks,
-        shifts,
-        name == "angle",
-        1.0 / rate,
-        min_strict,
-        min_coverage,
-        variance,
-    )
+    asked = averaging_factors(taus, rate=rate, window=length, tau_max=tau_max, order=order)
+    ks, interval = _fill_octaves(asked), 1.0 / rate
+    unit = Unit(length, hop, ks, name == "angle", interval, min_strict, min_coverage, variance)
     attrs = {
         "window_s": length / rate, "step_s": hop / rate,
         "window_samples": length, "step_samples": hop,
-        "overlap": overlap, "min_strict": min_strict, "min_coverage": min_coverage,
+        "overlap": "full", "min_strict": min_strict, "min_coverage": min_coverage,
         "variance": variance,
     }  # fmt: skip
     # a slice copies nothing
     reported = slice(None) if np.array_equal(ks, asked) else np.searchsorted(ks, asked)
     return Plan(signal, unit, rate, attrs, reported)
-
-
-def _thin_terms(ks: NDArray[np.int64], overlap: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the averaging factors that are computed, and the powers of two that thin them."""
-    if overlap == "full":
-        return ks, np.zeros_like(ks)
-    shifts = thin(ks)
-    ks = np.unique(ks >> shifts << shifts)
-    return ks, thin(ks)
 
 
 def _fill_octaves(ks: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -66,13 +66,10 @@ def is_described(chi2: Any, dof: Any) -> Any:
 class FitTables:
     """Tables that all windows of a surface share."""
 
-    def __init__(
-        self, ks: NDArray[np.int64], shifts: NDArray[np.int64], rate: float, window: int,
-        variance: str = "avar",
-    ):  # fmt: skip
+    def __init__(self, ks: NDArray[np.int64], rate: float, window: int, variance: str = "avar"):
         self.columns = variance_columns(variance, ks, rate)
         self.to_samples = sample_squares(rate)
-        self.pairs, self.ramps = product_tables(window, ks, shifts, variance=variance)
+        self.pairs, self.ramps = product_tables(window, ks, variance=variance)
         diagonal = np.einsum("abii->abi", self.pairs)
         self.diagonal = combine_diagonal(diagonal, np.einsum("aii->ai", self.ramps))
         self._detrend = partial(
@@ -119,16 +116,9 @@ def quantile_curve(level: float) -> tuple[float, float, NDArray[np.float64]]:
 
 
 @lru_cache(maxsize=4)
-def fit_tables(
-    ks: tuple[int, ...],
-    shifts: tuple[int, ...],
-    rate: float,
-    window: int,
-    variance: str = "avar",
-) -> FitTables:
+def fit_tables(ks: tuple[int, ...], rate: float, window: int, variance: str = "avar") -> FitTables:
     """Make the tables once for all parts of a record."""
-    factors, thinning = (np.array(values, dtype=np.int64) for values in (ks, shifts))
-    return FitTables(factors, thinning, rate, window, variance)
+    return FitTables(np.array(ks, dtype=np.int64), rate, window, variance)
 
 
 def fit_block(

@@ -173,9 +173,6 @@ class Windows:
     tau_max
         Longest averaging time, at most half of the window, or a third for hadamard and modified
         (default: two thirds of that).
-    overlap
-        full uses all second differences. octave uses fewer of them at long averaging times: faster
-        on long windows, 1 % more scatter.
     axis
         Analyse this gyro axis only: x. Repeat for more.
     variance
@@ -187,7 +184,6 @@ class Windows:
     step: Annotated[str | None, Parameter(metavar="DURATION")] = None
     taus: Annotated[str, Parameter(metavar="LIST")] = "40"
     tau_max: Annotated[str | None, Parameter(metavar="DURATION")] = None
-    overlap: Literal["full", "octave"] = "full"
     axis: Annotated[list[str] | None, Parameter(metavar="NAME", negative=())] = None
     variance: Literal["avar", "hadamard", "modified"] = "avar"
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gyrostab.errors import OptionError
+from gyrostab.noise import sampled_psd
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.units import HOUR
 
@@ -149,21 +150,36 @@ class LoggerFilter(Effect):
         return [nothing | point for point in points]
 
     def explain(self, windows: Windows) -> Prediction:
-        """Predict the factor on the spectrum of white noise."""
+        """Predict the factors on the spectra of the noise terms.
+
+        They are those in samples of the instrument. Aliases of white noise raise the whole
+        spectrum, those of quantization noise its upper part, and those of slow noise nothing.
+        """
         if not (self.cutoff or self.length):
             return Prediction()
         n = int(self.instrument) or FAST_INSTRUMENT_SAMPLES
-        return Prediction(response=self._digital_response(windows.frequency, windows.rate, n))
+        frequency, rate = np.asarray(windows.frequency, np.float64), windows.rate
+        alias = frequency[..., None] + rate * np.arange(n)
+        passed = self._digital_response(alias, rate, n)
+        folded = np.minimum(alias, n * rate - alias)
+        return Prediction(
+            response={
+                symbol: np.asarray(
+                    (passed * sampled_psd(symbol, folded, n * rate)).sum(axis=-1)
+                    / sampled_psd(symbol, frequency, rate)
+                )
+                for symbol in "QNBK"
+            }
+        )
 
-    def _digital_response(self, frequency: Array, rate: float, n: int) -> Array:
-        """Sum the response over all aliases, for `n` samples of the instrument per log sample."""
+    def _digital_response(self, f: Array, rate: float, n: int) -> Array:
+        """Return the power response at frequencies of an instrument with `n` samples per sample."""
         fast = n * rate
         if self.cutoff >= fast / 2.0:
             raise OptionError(
                 f"effect {self.name!r}: a cutoff of {self.cutoff:g} Hz is not below half of "
                 f"the instrument's {fast:g} Hz"
             )
-        f = np.asarray(frequency, np.float64)[..., None] + rate * np.arange(n)
         response = np.ones_like(f)
         if self.cutoff:
             ratio = np.tan(np.pi * f / fast) / math.tan(math.pi * self.cutoff / fast)
@@ -174,7 +190,7 @@ class LoggerFilter(Effect):
                     response
                     * (np.sin(np.pi * taps * f / fast) / (taps * np.sin(np.pi * f / fast))) ** 2
                 )
-        return np.asarray(response.sum(axis=-1))
+        return np.asarray(response)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         parts = []

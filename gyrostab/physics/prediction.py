@@ -72,8 +72,9 @@ class Prediction:
     #: (window, band) or (axis, window, band): parameter -> added two-sided power spectral density
     #: per unit of its square [degree2 hour-2 Hz-1].
     spectrum: Mapping[str, Array] = field(default_factory=dict)
-    #: (band,): squared magnitude by which the whole spectrum is multiplied (a filter).
-    response: Array | None = None
+    #: (band,): noise term, in the order Q, N, B, K -> factor by which a filter multiplies its
+    #: spectrum in the log. That of N applies to all that is not noise, too.
+    response: Mapping[str, Array] = field(default_factory=dict)
     #: Whether the added spectrum is one process on all axes, which then appears in the
     #: cross-spectra with one signed factor per axis.
     coherent: bool = False

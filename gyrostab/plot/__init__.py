@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from gyrostab.plot.adev import plot_adev
 from gyrostab.plot.coefficients import plot_coefficients
-from gyrostab.plot.comparison import plot_comparison
 from gyrostab.plot.correlation import plot_correlation
 from gyrostab.plot.figures import save_figures
 from gyrostab.plot.signal import plot_signal
@@ -22,7 +21,6 @@ __all__ = [
     "new_figure",
     "plot_adev",
     "plot_coefficients",
-    "plot_comparison",
     "plot_correlation",
     "plot_davar",
     "plot_davar_3d",

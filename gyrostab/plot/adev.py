@@ -23,7 +23,6 @@ from gyrostab.plot.style import (
     label_log_axis,
     new_figure,
     require_coefficients,
-    stack_panels,
     title_figure,
     unit_symbol,
     write_in_middle,
@@ -75,7 +74,7 @@ def plot_adev(
     )
     window = windows.isel(axis=0, time=0)
     tau = window["tau"].values
-    figure = new_figure(width / INCH_MM, 4.4, stacked=True)
+    figure = new_figure(width / INCH_MM, 4.4)
     panel = figure.subplots()
     colour = axis_style(product, name)["color"]
     low, high = interval_limits(window["avar"].values, window["edf"].values)
@@ -111,7 +110,7 @@ def plot_adev(
     panel.set_ylabel(f"{variance_name(product)} deviation σ(τ) [deg/h]")
     panel.grid(alpha=0.3)
     if is_narrow(figure):
-        figure.legend(loc="lower left", frameon=False)
+        figure.legend(loc="outside lower left", frameon=False)
     else:
         panel.legend()
     stamp = str(np.datetime_as_string(window["time"].values, unit="s")).replace("T", " ")
@@ -120,7 +119,6 @@ def plot_adev(
         f"{variance_name(product)} deviation of axis {name}",
         f"window centred on {stamp} UTC",
     )
-    stack_panels([panel])
     return figure
 
 

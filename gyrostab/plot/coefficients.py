@@ -22,7 +22,6 @@ from gyrostab.plot.style import (
     new_figure,
     require_coefficients,
     shade_spans,
-    stack_panels,
     time_axis,
     title_figure,
     unit_label,
@@ -67,7 +66,7 @@ def plot_coefficients(
     """
     require_coefficients(product)
     names = axis_names(product, axis)
-    figure = new_figure(width / INCH_MM, 7.6, stacked=True)
+    figure = new_figure(width / INCH_MM, 7.6)
     panels = figure.subplots(len(LAWS), 1, sharex=True)
     time = product["time"].values
     edges = find_time_edges(time)
@@ -85,14 +84,14 @@ def plot_coefficients(
     keys = _legend_handles(product, names)
     figure.legend(
         handles=keys,
-        loc="lower center",
+        loc="outside lower center",
         ncols=3 if is_narrow(figure) else len(keys),
         frameon=False,
     )
     whose = f" of axis {names[0]}" if len(names) == 1 else ""
     title_figure(figure, f"Noise coefficients{whose} over time", window_text(product))
     time_axis(panels[-1], edges)
-    stack_panels(panels, between=0.25)
+    figure.align_ylabels()
     return figure
 
 

@@ -20,7 +20,6 @@ from gyrostab.plot.style import (
     find_runs,
     new_figure,
     shade_spans,
-    stack_panels,
     time_axis,
     title_figure,
     unit_label,
@@ -88,7 +87,7 @@ def plot_signal(
             f"it has {', '.join(available) or 'none'}"
         )
     height = 0.9 + 1.2 * len(axes) + 1.0 * len(shown)
-    figure = new_figure(width / INCH_MM, height, stacked=True)
+    figure = new_figure(width / INCH_MM, height)
     ratios = [1.2] * len(axes) + [1.0] * len(shown)
     panels = figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
     for panel, axis_name in zip(panels, axes, strict=False):
@@ -106,7 +105,7 @@ def plot_signal(
     rate = log.attrs.get("sampling_rate_hz")
     title_figure(figure, f"{signal_text} as recorded", f"{float(rate):g} Hz" if rate else "")
     time_axis(panels[-1], log["time"][[0, -1]].values)
-    stack_panels(panels)
+    figure.align_ylabels()
     return figure
 
 

@@ -6,7 +6,7 @@ import base64
 import functools
 import io
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import IO, TYPE_CHECKING, Any, ParamSpec, cast
 
 import numpy as np
@@ -155,15 +155,13 @@ def axis_style(dataset: xr.Dataset, axis: str) -> dict[str, Any]:
     return {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number % len(MARKERS)]}
 
 
-def new_figure(width: float, height: float, *, stacked: bool = False) -> Figure:
-    """Make an empty figure [inches] with automatic layout, or for `stack_panels`."""
+def new_figure(width: float, height: float) -> Figure:
+    """Make an empty figure [inches] with automatic layout."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     from gyrostab.plot.notebook import NotebookFigure
 
-    figure = NotebookFigure(
-        figsize=(width, height), layout=None if stacked else "constrained", dpi=_DPI
-    )
+    figure = NotebookFigure(figsize=(width, height), layout="constrained", dpi=_DPI)
     FigureCanvasAgg(figure)  # attaches to the figure, so that text can be measured
     return figure
 
@@ -230,63 +228,6 @@ def _keep_literal(artist: Any) -> None:
         if isinstance(child, Text):
             child.set_parse_math(False)
         _keep_literal(child)
-
-
-def stack_panels(
-    panels: Sequence[Axes] | NDArray[Any], *, between: float = 0.1, right: float = 0.15
-) -> None:
-    """Lay out panels in one column, with aligned y labels, below the title and above the legend.
-
-    Only tick labels, title and legends are measured; the layout engine of matplotlib measures every
-    artist, twice.
-
-    Parameters
-    ----------
-    panels : sequence of matplotlib.axes.Axes
-        All panels of a figure made with ``stacked=True``, with their labels set.
-    between : float
-        Distance between panels [inches].
-    right : float
-        Space to the right of the panels [inches].
-    """
-    from matplotlib.transforms import ScaledTranslation
-
-    figure: Any = panels[0].figure
-    _keep_literal(figure)  # before the labels are measured
-    width, height = figure.get_size_inches()
-    renderer = figure.canvas.get_renderer()
-
-    def inches(artist: Any, side: str) -> float:
-        return float(getattr(artist.get_window_extent(renderer), side) / figure.dpi)
-
-    title = figure._suptitle
-    top = between + 0.05 + (inches(title, "height") + 0.08 if title else 0.0)
-    below = max((inches(legend, "height") for legend in figure.legends), default=0.0)
-    bottom = 0.42 + below
-    average = (height - top - bottom - between * (len(panels) - 1)) / len(panels)
-    figure.subplots_adjust(
-        top=1 - top / height,
-        bottom=bottom / height,
-        right=1 - right / width,
-        hspace=between / average,
-    )
-    ticks = [
-        inches(label, "width")
-        for panel in panels
-        for label in panel.get_yticklabels(which="both")
-        if label.get_text()
-    ]
-    to_label = max(ticks, default=0.0) + 0.1
-    labels = max(inches(panel.yaxis.label, "width") for panel in panels)
-    figure.subplots_adjust(left=(to_label + labels + 0.06) / width)
-    if title:
-        title.set_y(1 - 0.06 / height)
-    for panel in panels:
-        panel.yaxis.set_label_coords(
-            0.0,
-            0.5,
-            transform=panel.transAxes + ScaledTranslation(-to_label, 0.0, figure.dpi_scale_trans),
-        )
 
 
 def label_log_axis(axis: Axis, low: float, high: float) -> None:

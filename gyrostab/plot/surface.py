@@ -19,7 +19,6 @@ from gyrostab.plot.style import (
     label_log_axis,
     log_edges,
     new_figure,
-    stack_panels,
     time_axis,
     title_figure,
     unit_of_time,
@@ -79,7 +78,7 @@ def plot_davar(
     from matplotlib.patches import Patch
 
     names = axis_names(product, axis)
-    figure = new_figure(width / INCH_MM, 1.1 + 1.9 * len(names), stacked=True)
+    figure = new_figure(width / INCH_MM, 1.1 + 1.9 * len(names))
     panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     time, tau = product["time"].values, product["tau"].values
     cells, merged = _merge_windows(product, names, columns)
@@ -121,7 +120,10 @@ def plot_davar(
         handles.append(_dot_handle())
     if handles:
         figure.legend(
-            handles=handles, loc="lower left", ncols=1 if is_narrow(figure) else 2, frameon=False
+            handles=handles,
+            loc="outside lower left",
+            ncols=1 if is_narrow(figure) else 2,
+            frameon=False,
         )
     title_figure(
         figure,
@@ -130,8 +132,17 @@ def plot_davar(
         f"{merged} windows averaged per column" if merged > 1 else "",
     )
     time_axis(panels[-1], time_edges)
-    stack_panels(panels, right=0.8)
-    _colour_bar(figure, mesh, label, relative=relative)
+    figure.align_ylabels(panels)
+    bar = figure.colorbar(
+        mesh,
+        ax=panels,
+        label=label,
+        extend="both",
+        fraction=0.08,
+        pad=0.01,
+        aspect=12 * len(names),
+    )
+    _label_colours(bar, relative=relative)
     return figure
 
 
@@ -258,13 +269,9 @@ def _colour_limits(values: list[NDArray[Any]], *, relative: bool) -> tuple[float
     return (float(low), float(high if high > low else 1.001 * low))
 
 
-def _colour_bar(figure: Figure, mesh: Any, label: str, *, relative: bool) -> None:
-    """Draw the colour bar to the right of the panels."""
-    margins = figure.subplotpars
-    gap, breadth = 0.08 / figure.get_figwidth(), 0.16 / figure.get_figwidth()
-    area = (margins.right + gap, margins.bottom, breadth, margins.top - margins.bottom)
-    bar = figure.colorbar(mesh, cax=figure.add_axes(area), label=label, extend="both")
-    low, high = mesh.get_clim()
+def _label_colours(bar: Any, *, relative: bool) -> None:
+    """Label the colour bar with numbers; one of ratios with round ones."""
+    low, high = bar.mappable.get_clim()
     label_log_axis(bar.ax.yaxis, low, high)
     if relative:
         ticks = [

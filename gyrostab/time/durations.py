@@ -223,14 +223,3 @@ def _spaced_factors(count: int, limit: int) -> NDArray[np.int64]:
     if count >= 2 * limit * np.log(limit) + 2:  # spaced by less than half a sample everywhere
         return np.arange(1, limit + 1, dtype=np.int64)
     return np.unique(np.round(np.geomspace(1, limit, count)).astype(np.int64))
-
-
-def thin(ks: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Find how far to thin the second differences: the largest shift with ``k >= 8 * 2**shift``.
-
-    Examples
-    --------
-    >>> thin(np.array([1, 15, 16, 100, 40000]))
-    array([ 0,  0,  1,  3, 12])
-    """
-    return np.maximum(np.floor(np.log2(ks)).astype(np.int64) - 3, 0)

@@ -22,7 +22,6 @@ from gyrostab.kernels.allan.surface import Unit, surface_unit
 from gyrostab.kernels.workspace import Workspace, Workspaces
 from gyrostab.schema import ESTIMATORS
 from gyrostab.store.lazy import make_lazy
-from gyrostab.time.durations import thin
 from tests.reference import direct_angle_surface, direct_surface
 from tests.support.published import published_davar
 
@@ -107,39 +106,18 @@ class TestAgainstTheDefinition:
         floor = 1e-11 * np.nanmax(np.abs(x), initial=1.0) ** 2 * 1e4
         np.testing.assert_allclose(result["avar"].values[0], avar, rtol=1e-9, atol=floor)
 
-    def test_thinned_terms_are_the_multiples_of_the_stride(self):
-        x = np.random.default_rng(2).standard_normal(9000)
-        x[3000:3040] = np.nan
-        result = davar(
-            log_of(x),
-            window="4000samples",
-            step="700samples",
-            taus=24,
-            overlap="octave",
-            min_strict=0.0,
-        )
-        ks = np.round(result.tau.values * 100).astype(int)
-        shifts = np.maximum(np.floor(np.log2(ks)).astype(int) - 3, 0)
-        assert np.all(ks % 2**shifts == 0)
-        assert shifts.max() > 3
-        avar, count = direct_surface(x, 4000, 700, list(ks), shifts=list(shifts))
-        np.testing.assert_array_equal(result["count"].values[0], count)
-        np.testing.assert_allclose(result["avar"].values[0], avar, rtol=1e-12)
-
-    @pytest.mark.parametrize("octave", [False, True])
     @pytest.mark.parametrize(
         ("window", "step", "longest"), [(3000, 700, 1408), (150_000, 75_000, 20_480)]
     )
-    def test_unit_longer_than_the_angle_buffer(self, window, step, longest, octave):
+    def test_unit_longer_than_the_angle_buffer(self, window, step, longest):
         rng = np.random.default_rng(5)
         x = rng.standard_normal(350_000) + 7.0
         for start in rng.integers(0, x.size, 40):
             x[start : start + 90] = np.nan
         ks = np.array([1, 2, 3, 4, 5, 6, 7, 8, 9, 24, 160, longest])
-        shifts = thin(ks) if octave else np.zeros_like(ks)
-        assert held_points(x.size + 1, step, ks, shifts) < x.size / 1.4
-        cells, _ = surface_unit(x, Unit(window, step, ks, shifts, False, 0.01, 0.0, 0.0))
-        avar, count = direct_surface(x, window, step, list(ks), shifts=list(shifts))
+        assert held_points(x.size + 1, step, ks) < x.size / 1.4
+        cells, _ = surface_unit(x, Unit(window, step, ks, False, 0.01, 0.0, 0.0))
+        avar, count = direct_surface(x, window, step, list(ks))
         np.testing.assert_array_equal(cells[1], count)
         np.testing.assert_allclose(cells[0], avar, rtol=1e-10)
 
@@ -200,13 +178,12 @@ class TestAgainstPeers:
 
 class TestInvariance:
     @pytest.mark.parametrize("chunk", [999, 4096, 20_000])
-    @pytest.mark.parametrize("overlap", ["full", "octave"])
-    def test_bits_do_not_depend_on_the_chunking(self, chunk, overlap):
+    def test_bits_do_not_depend_on_the_chunking(self, chunk):
         rng = np.random.default_rng(7)
         x = rng.standard_normal((2, 20_000))
         x[0, 5000:5003] = x[1, rng.random(20_000) < 0.1] = np.nan
         log = log_of(x, channels={"temperature": (np.linspace(20, 30, 20_000), "degC")})
-        options = {"window": "3000samples", "step": "250samples", "taus": 15, "overlap": overlap}
+        options = {"window": "3000samples", "step": "250samples", "taus": 15}
         whole = davar(log, **options)
         with dask.config.set(scheduler="sync"):
             lazy = davar(log.chunk(time=chunk), **options)
@@ -362,7 +339,7 @@ class TestGaps:
         x = np.random.default_rng(6).standard_normal(30_000) + 3.0
         x[5000:5800] = x[20_000:20_700] = np.nan
         ks = np.array([1, 30, 200, 300])
-        unit = Unit(1000, 300, ks, np.zeros_like(ks), False, 0.01, 0.3, 0.1)
+        unit = Unit(1000, 300, ks, False, 0.01, 0.3, 0.1)
         cells, _ = surface_unit(x, unit)
         bridged = np.flatnonzero((cells[4] == WEIGHTED).any(axis=1))
         assert bridged.size >= 8
@@ -558,10 +535,9 @@ def test_trend_is_that_of_a_straight_line_through_the_present_samples(kind):
         assert float(surface.trend_response[0, j]) == pytest.approx(share, rel=1e-9)
 
 
-@pytest.mark.parametrize("overlap", ["full", "octave"])
-def test_long_averaging_times_alone_have_the_degrees_of_freedom_of_the_same_noise(overlap):
+def test_long_averaging_times_alone_have_the_degrees_of_freedom_of_the_same_noise():
     log = log_of(np.random.default_rng(1).standard_normal(120_000))
-    options = {"window": "1min", "step": "1min", "overlap": overlap}
+    options = {"window": "1min", "step": "1min"}
     few, octaves = (
         davar(log, taus=["5.12s", "20.48s"], **options),
         davar(log, taus="octave", tau_max="20.48s", **options),

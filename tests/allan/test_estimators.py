@@ -58,7 +58,7 @@ def test_the_bound_is_that_of_the_exact_likelihood(estimators, covariances, ramp
 def test_wavelet_variances_are_those_published_for_the_method_of_wavelet_moments():
     """Manual of the R package gmwm, processes to Haar wavelet variance, at scale 2 k."""
     ks = 2 ** np.arange(9)
-    tables = window_fit.fit_tables(tuple(ks.tolist()), (0,) * ks.size, RATE, 2048)
+    tables = window_fit.fit_tables(tuple(ks.tolist()), RATE, 2048)
     variances = tables.columns / 2 / tables.to_samples
     scale = 2.0 * ks
     np.testing.assert_allclose(variances[:, 0], 6 / scale**2, rtol=1e-9)

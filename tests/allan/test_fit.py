@@ -101,7 +101,7 @@ def test_degrees_of_freedom_are_those_of_greenhall():
     for alpha, term in ((0, 1), (-1, 2), (-2, 3)):
         for k in (20, 100, 333):
             ks = np.array([k])
-            product = product_tables(window, ks, np.zeros(1, dtype=np.int64))[0][term, term, 0, 0]
+            product = product_tables(window, ks)[0][term, term, 0, 0]
             mean = {1: 1 / k, 2: 2 * np.log(2) / np.pi, 3: k / 3}[term]
             expected = edf_greenhall(alpha, 2, k, window + 1, overlapping=True, modified=False)
             assert 2 * mean**2 / product == pytest.approx(expected, rel=0.05)
@@ -133,9 +133,7 @@ def test_covariance_between_averaging_times_is_that_of_simulated_noise():
     from gyrostab.noise import sample_squares
 
     squares = np.array([0.2, 0.01, 0.0, 30.0]) ** 2 * sample_squares(RATE)[:4]
-    predicted = np.einsum(
-        "a,b,abij->ij", squares, squares, product_tables(600, ks, np.zeros_like(ks))[0]
-    )
+    predicted = np.einsum("a,b,abij->ij", squares, squares, product_tables(600, ks)[0])
     scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
     np.testing.assert_allclose(np.cov(avar.T) / scale, predicted / scale, atol=0.12)
 
@@ -320,7 +318,7 @@ def test_interval_of_a_marginal_ramp_on_a_strong_random_walk_holds():
     """The value is shrunk where the ramp is not observed; the binomial sd of the share is 1.1 %."""
     rng = np.random.default_rng(12)
     x = random_walk(rng, 400, 3000, K=400.0, rate=RATE)
-    spread = np.sqrt(window_fit.fit_tables((1, 2), (0, 0), RATE, 3000).trend_variance[3]) * 400.0
+    spread = np.sqrt(window_fit.fit_tables((1, 2), RATE, 3000).trend_variance[3]) * 400.0
     x += white(rng, 400, 3000, N=0.01, rate=RATE) + 2.5 * spread * np.arange(3000) / RATE / 3600
     product = fit_noise(windows_of(x, taus=21), observed_only=False)
     held = abs(product.R - 2.5 * spread) <= NORMAL_95 * product.R_stderr
@@ -504,8 +502,7 @@ def test_nonnegative_solution_is_optimal():
     for _ in range(50):
         design = rng.standard_normal((12, 5)) * 10.0 ** rng.integers(-6, 6, 5)
         data = rng.standard_normal(12)
-        solution = np.empty(5)
-        solve_nonnegative(design.T @ design, design.T @ data, solution)
+        solution = solve_nonnegative(design.T @ design, design.T @ data)
         expected, residual = nnls(design, data)
         assert np.linalg.norm(design @ solution - data) <= residual * (1 + 1e-6)
         np.testing.assert_allclose(design @ solution, design @ expected, atol=1e-5)
@@ -546,7 +543,7 @@ def test_fast_fit_equals_the_reference_implementation(law, share, block):
 def cells_of(surface):
     """Arguments of `window_fit.run_kernel` for the windows of a surface with one axis."""
     cells, ks, rate, window = fit_inputs(surface)
-    tables = window_fit.fit_tables(tuple(ks.tolist()), (0,) * ks.size, rate, window)
+    tables = window_fit.fit_tables(tuple(ks.tolist()), rate, window)
     flat = [np.ascontiguousarray(cell[0], dtype=np.float64) for cell in cells[:5]]
     trend, *responses, exact = (cell[0, :, 0] for cell in cells[5:])
     return flat, trend, np.stack(responses, axis=-1), exact, tables
@@ -676,7 +673,7 @@ def test_table_of_products_is_the_sum_over_all_pairs_of_terms():
             for m in range(window - 2 * k + 1)
         ]
         differences.append(np.array(rows))
-    got, _ = product_tables(window, ks, np.zeros_like(ks))
+    got, _ = product_tables(window, ks)
     for i, first in enumerate(differences):
         for j, second in enumerate(differences):
             white_part = first @ second.T / (2.0 * ks[i] * ks[j])

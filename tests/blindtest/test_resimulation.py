@@ -34,6 +34,7 @@ EFFECTS: list[dict[str, Any]] = [
     {"name": "rotation_line", "amplitude": [0.05], "phase": [40.0]},
     {"name": "dead_zone", "width": 0.05},
     {"name": "shared_source", "N": [0.002]},
+    {"name": "spikes", "kind": "outlier", "per_hour": 10.0, "size": 6.0},
     {"name": "feedback_reset", "kick": 60.0, "phase": "channel"},
 ]
 

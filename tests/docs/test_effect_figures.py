@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gyrostab.errors import OptionError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import effects
-from gyrostab.plot import plot_comparison
 from tests.conftest import ROOT
 from tests.support.pictures import same_layout
 from tests.support.scripts import load_script
@@ -81,7 +79,7 @@ def test_the_panels_show_what_the_closed_forms_say() -> None:
     own, common = rng.standard_normal((2, 36_000)), rng.standard_normal(36_000)
     without = make_log(own, rate=10.0, unit="deg/h")
     louder = make_log(np.stack([own[0] + common, own[1] - common]) + 3.0, rate=10.0, unit="deg/h")
-    figure = plot_comparison(without, louder, window="10min", moments=[1800.0, *range(9)])
+    figure = SCRIPT.plot_comparison(without, louder, window="10min", moments=[1800.0, *range(9)])
     curves, means, power, across = figure.axes
     before, after, *others = (np.asarray(line.get_ydata(), float) for line in curves.get_lines())
     assert len(others) == 9
@@ -105,17 +103,9 @@ def test_coherency_tells_quadrature_and_its_sign() -> None:
         make_log(noise + size * np.stack([np.cos(turn), -np.sin(turn)]), rate=10.0, unit="deg/h")
         for size in (0.0, 1.0)
     ]
-    panel = plot_comparison(*logs, window="1min", coherency=True).axes[3]
+    panel = SCRIPT.plot_comparison(*logs, window="1min", coherency=True).axes[3]
     lines = panel.get_lines()[2:]
     at = np.abs(np.asarray(lines[0].get_xdata(), float) - 0.5).argmin()
     values = {str(line.get_label()): float(np.asarray(line.get_ydata())[at]) for line in lines}
     assert values["in quadrature"] == pytest.approx(1.0, abs=0.02)  # y is a quarter turn ahead
     assert values["in phase"] == pytest.approx(0.0, abs=0.05)
-
-
-def test_logs_that_do_not_belong_together_are_refused() -> None:
-    log = make_log(np.zeros((2, 600)), rate=10.0, unit="deg/h")
-    with pytest.raises(OptionError, match="the same axes, at least two"):
-        plot_comparison(log, make_log(np.zeros((2, 500)), rate=10.0, unit="deg/h"), window="20s")
-    with pytest.raises(OptionError, match="driver 'vibration' is not in the log"):
-        plot_comparison(log, log, window="20s", driver="vibration")

@@ -231,34 +231,41 @@ def _measure_coherencies(spectrum: NDArray[Any], other_spectrum: NDArray[Any]) -
 def _sample_counts(values: Array) -> dict[str, Array]:
     """Return roots of counts: zeros, repeats, range ends, outliers, copies; log number of levels.
 
+    With them, the logarithm of the largest departure of a sample from its neighbours.
+
     They are of the whole record. Losses are drawn at other instants in each simulated record, so
     that most segments have none and few have many: a common scatter would not describe them.
     """
     steps = np.diff(values, append=np.nan)
     good = values[np.isfinite(values)]
+    outliers, largest = _measure_outliers(values)
     counts = {
         "zeros": (values == 0.0).sum(),
         "repeats": ((steps == 0.0) & (values != 0.0)).sum(),
         "ends": ((good == good.min()) | (good == good.max())).sum(),
-        "outliers": _count_outliers(values),
+        "outliers": outliers,
         "copies": good.size - np.unique(good).size,
     }
     return {
         **{f"count {name}": np.sqrt([count + 0.375]) for name, count in counts.items()},
         "levels": np.array([np.log(np.unique(good[:20_000]).size)]),
+        "largest departure": np.array([largest]),
     }
 
 
-def _count_outliers(values: Array) -> int:
+def _measure_outliers(values: Array) -> tuple[int, float]:
     """Count samples that depart from the median of their neighbours by more than chance allows.
 
-    Normal noise has one such sample in a record.
+    Normal noise has one such sample in a record. Returned with the count is the logarithm of the
+    largest departure in units of their standard deviation.
     """
     windows = sliding_window_view(values, 2 * _NEIGHBOURS + 1)
     neighbours = np.delete(windows, _NEIGHBOURS, axis=1)
     departure = np.abs(windows[:, _NEIGHBOURS] - np.median(neighbours, axis=1))
-    limit = -1.4826 * np.nanmedian(departure) * float(ndtri(0.5 / departure.size))
-    return int((departure > limit).sum())
+    typical = 1.4826 * np.nanmedian(departure)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        largest = float(np.log(np.nanmax(departure) / typical))
+    return int((departure > -typical * float(ndtri(0.5 / departure.size))).sum()), largest
 
 
 def _channel_couplings(

@@ -41,10 +41,10 @@ def band_columns(blocks: xr.Dataset) -> Array:
 def noise_powers(blocks: xr.Dataset, response: Array | None = None) -> Array:
     """Return `band_columns` with the gaps of each block, (axis, block, band, term).
 
-    The response (band,) is that of a filter before samples were lost.
+    The response (band, term) is that of a filter before samples were lost.
     """
-    term_powers = band_columns(blocks).T * (1.0 if response is None else response)
-    return np.stack([spread_by_gaps(power[None, None], blocks) for power in term_powers], axis=-1)
+    columns = band_columns(blocks) * (1.0 if response is None else response)
+    return np.stack([spread_by_gaps(power[None, None], blocks) for power in columns.T], axis=-1)
 
 
 def sum_noise(columns: Array, squares: Array | Sequence[Array]) -> Array:

@@ -57,7 +57,8 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
     shape = (len(axes), blocks.sizes["block"], blocks.sizes["band"])
     mean, random = np.zeros(shape[:2]), _RandomMeans(shape)
     squares = np.repeat(square[:, None], shape[1], axis=1)
-    added, response = np.zeros(shape), np.ones((shape[0], 1, shape[2]))
+    # factors of filters on the noise terms, (axis, band, term)
+    added, response = np.zeros(shape), np.ones((shape[0], shape[2], len(NOISE)))
     narrow: list[tuple[Effect, list[int], Array]] = []
     coherent: list[tuple[NDArray[np.complex128], Array]] = []
     left_out = []
@@ -78,7 +79,7 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
         for (term, name), values in prediction.level.items():
             place = NOISE.index(term)
             squares[rows, :, place] += square[rows, None, place] * sizes(name)[:, None] * values
-        if prediction.response is not None:
+        if prediction.response:
             response[rows] *= band_response(effect, blocks)
         for factor, density in _added_powers(effect, prediction, rows, blocks):
             power = np.abs(factor[:, None, None]) ** 2 * density
@@ -88,11 +89,12 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
             if prediction.line is not None and factor.any():
                 narrow.append((effect, rows, power))
         random.add(prediction, rows, sizes)
-    noise = np.einsum("fn,abn->abf", band_columns(blocks), np.maximum(squares, 0.0))
-    spectrum = spread_by_gaps((noise + added) * response, blocks)
-    variables = _shared_cross(coherent, response, blocks)
+    white_response = response[:, None, :, NOISE.index("N")]
+    noise = np.einsum("fn,afn,abn->abf", band_columns(blocks), response, np.maximum(squares, 0.0))
+    spectrum = spread_by_gaps(noise + added * white_response, blocks)
+    variables = _shared_cross(coherent, white_response, blocks)
     if narrow and "line_power" in blocks:
-        variables |= expect_lines(blocks, narrow, response[:, 0])
+        variables |= expect_lines(blocks, narrow, white_response[:, 0])
     white_share = 1.0 - random.power / spectrum[..., 0]
     return KnownEffects(mean, spectrum, white_share, variables | random.variables(), left_out)
 
@@ -159,7 +161,7 @@ def _shows_elsewhere(prediction: Prediction) -> bool:
     if elsewhere or prediction.phase_locked or not is_steady:
         return True
     is_shown = prediction.mean or prediction.level or prediction.spectrum
-    return not is_shown and prediction.response is None
+    return not is_shown and not prediction.response
 
 
 def _is_steady(time: float, variance: Array) -> bool:

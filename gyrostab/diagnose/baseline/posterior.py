@@ -109,20 +109,19 @@ def fit_squares(fit: Fit) -> tuple[Array, Array, Array]:
         normal, right, to_noise, to_right = _eliminate_free_sizes(
             free_columns, precision, fit.columns, fit.rest(), weight
         )
-        solution = np.empty(width)
-        solve_nonnegative(normal, right, solution)
-        next_spectrum = np.asarray(fit.columns @ np.maximum(solution, 0.0), dtype=np.float64)
+        solution = solve_nonnegative(normal, right)
+        next_spectrum = np.asarray(fit.columns @ solution, dtype=np.float64)
         if free_columns.shape[1] or fit.known is not None:
             next_spectrum = (
                 next_spectrum
                 + (fit.power - fit.rest())
-                + free_columns @ (to_right - to_noise @ np.maximum(solution, 0.0))
+                + free_columns @ (to_right - to_noise @ solution)
             )
             next_spectrum = np.asarray(np.maximum(next_spectrum, _MIN_POWER_RATIO * spectrum))
         if not (next_spectrum > 0.0).all():
             break
         fraction = _choose_step(fit, spectrum, next_spectrum) if has_powers_only else 1.0
-        square = square + fraction * (np.maximum(solution, 0.0) - square)
+        square = square + fraction * (solution - square)
         next_spectrum = spectrum + fraction * (next_spectrum - spectrum)
         change = np.abs(next_spectrum / spectrum - 1.0).max()
         spectrum = next_spectrum
@@ -169,7 +168,7 @@ def _eliminate_free_sizes(
 def fit_filter_response(
     blocks: xr.Dataset, fits: Sequence[Fit], *, settings: Settings = DEFAULTS
 ) -> Array | None:
-    """Return the response (band,) of the filter that describes the powers of all axes best.
+    """Return the response (band, term) of the filter that describes the powers of all axes best.
 
     A low-pass or an average removes most of the noise at high frequencies, and leaves that of the
     block means. A fit without the filter would take the steep slope for B and K, and the floor of
@@ -181,9 +180,7 @@ def fit_filter_response(
         band_response(LoggerFilter.example(**values), blocks)
         for values in LoggerFilter.example().points(make_windows(blocks, {}))
     ]
-    behind = [
-        [fit_behind(fit, fit.columns * response[:, None]) for fit in fits] for response in responses
-    ]
+    behind = [[fit_behind(fit, fit.columns * response) for fit in fits] for response in responses]
     chosen = choose_filter(behind, settings)
     is_better = [
         nats > fit_behind(fit, fit.columns)[0]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from gyrostab.diagnose.baseline.expected_statistics import (
     band_columns,
@@ -24,6 +25,7 @@ from gyrostab.physics.registry import effects
 Array = NDArray[np.float64]
 
 ZOOM_POINTS, ZOOM_STEPS = 21, 4  # of the refinement of a cutoff on its grid
+_CUTOFF_STEP = 0.01  # relative, of the likeliest cutoff; limits resolution
 
 GRID_REACH = 0.25  # distance in ln(cutoff) of one place on the grid of filters
 
@@ -48,7 +50,7 @@ def fit_filter_sizes(
 
     def fit_all(values: Mapping[str, Any]) -> list[tuple[float, float]]:
         response = band_response(kind.example(**values), state.blocks)
-        filtered = band_columns(state.blocks) * response[:, None]
+        filtered = band_columns(state.blocks) * response
         return [fit_behind(fit, mixing @ filtered) for fit, mixing in fits]
 
     def likelihood(values: Mapping[str, Any]) -> float:
@@ -59,6 +61,7 @@ def fit_filter_sizes(
         for variant in components[0].candidate.variants
         if components[0].statistic.is_filter(variant)
     ]
+    family += _best_sizes(family, likelihood)
     behind = [fit_all(values) for values in family]
     log = [sum(nats for nats, _ in axes) for axes in behind]
     best = family[choose_filter(behind, state.settings)]
@@ -86,6 +89,32 @@ def fit_filter_sizes(
             ],
         )
     }, other_values
+
+
+def _best_sizes(
+    family: Sequence[Mapping[str, Any]], likelihood: Callable[[Mapping[str, Any]], float]
+) -> list[dict[str, Any]]:
+    """Return the likeliest cutoff of each kind of low-pass, between its neighbours on the grid.
+
+    A strong filter has a narrower likelihood than the grid is fine.
+    """
+    kinds: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for values in family:
+        if values["cutoff"]:
+            kind = tuple(value for name, value in values.items() if name != "cutoff")
+            kinds.setdefault(kind, []).append(values)
+    likeliest = []
+    for low_passes in kinds.values():
+        best = max(range(len(low_passes)), key=lambda place: likelihood(low_passes[place]))
+        values, cutoffs = low_passes[best], [float(point["cutoff"]) for point in low_passes]
+        minimum = minimize_scalar(
+            lambda cutoff: -likelihood({**values, "cutoff": cutoff}),  # noqa: B023
+            bounds=(cutoffs[max(best - 1, 0)], cutoffs[min(best + 1, len(cutoffs) - 1)]),
+            method="bounded",
+            options={"xatol": _CUTOFF_STEP * cutoffs[best]},
+        )
+        likeliest.append({**values, "cutoff": float(minimum.x)})
+    return likeliest
 
 
 def _refine_on_grid(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.calibrate import assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import (
+    NOISE,
     common_variance,
     noise_powers,
     white_variance,
@@ -49,7 +50,7 @@ class AxisEffects:
     """What the effects do on one axis."""
 
     known: Array  # (block, band): power of fixed size
-    response: Array  # (band,): factor of the noise
+    response: Array  # (band, term): factor of the noise
     doubt: float  # relative error of `known`
     free: list[Array] = field(default_factory=list)  # (block, band): power per unit of a free size
     means: list[Array] = field(default_factory=list)  # (block,): means per unit of a free size
@@ -204,7 +205,7 @@ def _collect_effects(
     shape = (blocks.sizes["block"], blocks.sizes["band"])
     # twice the error of the size, because power grows with its square
     doubt = 2.0 * identifications.state.settings.size_error_share
-    out = AxisEffects(np.zeros(shape), np.ones(shape[1]), doubt)
+    out = AxisEffects(np.zeros(shape), np.ones((shape[1], len(NOISE))), doubt)
     start = identifications.start_state(baseline)
     touched = False
     for identification in identifications.identified:
@@ -286,7 +287,8 @@ def _fit_noise(
     square = np.maximum(square, [0.0, floor_square(fit), 0.0, 0.0])
     count = blocks.sizes["axis"]
     variance = white_variance(blocks, np.tile(square, (count, 1)))[row]
-    variance = variance * np.maximum(state.weight[row, :, 0] / (columns[:, 0] @ square), 0.1)
+    unfiltered = noise_powers(blocks)[row, :, 0] @ square
+    variance = variance * np.maximum(state.weight[row, :, 0] / unfiltered, 0.1)
     effect_means = np.stack(axis_effects.means, axis=1) if axis_effects.means else None
     return noise_posterior(fit, blocks, row, variance, chosen, effect_means, state.settings)
 

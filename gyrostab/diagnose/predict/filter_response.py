@@ -17,6 +17,7 @@ from gyrostab.diagnose.predict.windows import (
 )
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.kernels.spectra.line_levels import local_level
+from gyrostab.noise import sampled_psd
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction
 from gyrostab.physics.registry import effects
@@ -41,15 +42,25 @@ def _estimate_size(power: Array, full: Array) -> float:
 
 
 def band_response(effect: Effect, blocks: xr.Dataset) -> Array:
-    """Return the noise power factor of each band, averaged over its frequencies."""
-    return np.asarray(_responses_in_bands(effect, blocks).mean(axis=1))
+    """Return the factor (band, term) on the power of the noise terms Q, N, B and K in each band.
+
+    It is averaged over the power of the term at the frequencies of the band.
+    """
+    frequency, rate = frequencies_in_bands(blocks), float(blocks.attrs["sampling_rate_hz"])
+    factors = []
+    for symbol, response in _responses_at(effect, blocks, frequency).items():
+        power = sampled_psd(symbol, frequency, rate)
+        passed = _split_into_bands(power * response).mean(axis=1)
+        factors.append(passed / _split_into_bands(power).mean(axis=1))
+    return np.stack(factors, axis=-1)
 
 
 def with_band_response(prediction: Prediction, effect: Effect, blocks: xr.Dataset) -> Prediction:
     """Return a prediction with its response averaged over each band, which may hold a zero."""
-    if prediction.response is None:
+    if not prediction.response:
         return prediction
-    return replace(prediction, response=band_response(effect, blocks))
+    factors = band_response(effect, blocks).T
+    return replace(prediction, response=dict(zip(prediction.response, factors, strict=True)))
 
 
 def band_shape_factor(effect: Effect, blocks: xr.Dataset) -> Array:
@@ -57,21 +68,18 @@ def band_shape_factor(effect: Effect, blocks: xr.Dataset) -> Array:
 
     Lines of unequal power have fewer degrees of freedom together than equal ones.
     """
-    response = _responses_in_bands(effect, blocks)
+    response = _split_into_bands(_responses_at(effect, blocks, frequencies_in_bands(blocks))["N"])
     return np.asarray(response.mean(axis=1) ** 2 / (response**2).mean(axis=1))
 
 
-def _responses_in_bands(effect: Effect, blocks: xr.Dataset) -> Array:
-    """Return the power response (band, frequency)."""
-    return _response_at(effect, blocks, frequencies_in_bands(blocks)).reshape(
-        -1, FREQUENCIES_PER_BAND
-    )
+def _split_into_bands(values: Array) -> Array:
+    """Return values at `frequencies_in_bands` as (band, frequency)."""
+    return values.reshape(-1, FREQUENCIES_PER_BAND)
 
 
-def _response_at(effect: Effect, blocks: xr.Dataset, frequency: Array) -> Array:
-    """Return the power response at frequencies, 1 if there is none."""
-    response = effect.explain(replace(make_windows(blocks, {}), frequency=frequency)).response
-    return np.ones(frequency.size) if response is None else np.asarray(response)
+def _responses_at(effect: Effect, blocks: xr.Dataset, frequency: Array) -> Mapping[str, Array]:
+    """Return the factors of a filter at frequencies, by noise term."""
+    return effect.explain(replace(make_windows(blocks, {}), frequency=frequency)).response
 
 
 def undo_filter(
@@ -90,7 +98,7 @@ def undo_filter(
         Density without the filter, up to a factor.
     """
     frequency = blocks["line_frequency"].values
-    full = _response_at(effects()[effect].example(**values), blocks, frequency)
+    full = _responses_at(effects()[effect].example(**values), blocks, frequency)["N"]
     weight = axis_values(blocks, "line_weight", axis)
     power = axis_values(blocks, "line_power", axis)
     good = (weight > 0) & np.isfinite(power).all(axis=1)

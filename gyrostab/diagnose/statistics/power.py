@@ -161,8 +161,8 @@ class Power(Statistic):
                 design = np.stack([densities[name] for name in chosen])
                 yield Variant(case.values, chosen, design, squared=squared)
         response = case.prediction.response
-        if response is not None:
-            change = _filter_change(response, case.coefficient, frequency, rate)
+        if response:  # on noise as it was logged, whose N contains the aliases
+            change = _filter_change(response["N"], case.coefficient, frequency, rate)
             yield Variant(case.values, (), change[None])
 
     def model(

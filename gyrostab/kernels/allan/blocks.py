@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gyrostab.kernels.allan.integrate import TILE, integrate_tile, thin_pyramid
+from gyrostab.kernels.allan.integrate import TILE, integrate_tile
 from gyrostab.kernels.allan.plain_sums import CONSECUTIVE_LAGS, MAX_LAGS
 from gyrostab.kernels.compiled import INNER, KERNEL
 
@@ -42,70 +42,62 @@ class Cut(NamedTuple):
 
     step: int  # samples of a block
     ks: NDArray[np.int64]  # (n_tau,): averaging factors
-    shifts: NDArray[np.int64]  # (n_tau,): every ``2**shift``-th term is used
     head_lengths: NDArray[np.int64]  # (n_tau,): terms of a head
     whole_blocks: NDArray[np.int64]  # (n_tau,): blocks of a window, not rising
     n_windows: int  # windows: there are ``n_windows + whole_blocks[0]`` blocks
 
 
-def group_factors(ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> NDArray[np.int64]:
+def group_factors(ks: NDArray[np.int64]) -> NDArray[np.int64]:
     """Group the averaging factors that share one pass over the angle: first of each, and the end.
 
-    The factors of a group have one shift; a group has at most `MAX_LAGS` of them, or
-    `CONSECUTIVE_LAGS` that follow each other.
+    A group has at most `MAX_LAGS` of them, or `CONSECUTIVE_LAGS` that follow each other.
     """
-    starts = np.flatnonzero(np.diff(shifts)) + 1
-    lags = ks >> shifts
     first: list[int] = []
-    for at, end in zip([0, *starts], [*starts, shifts.size], strict=True):
-        while (
-            at + CONSECUTIVE_LAGS <= end
-            and lags[at + CONSECUTIVE_LAGS - 1] - lags[at] == CONSECUTIVE_LAGS - 1
-        ):
-            first.append(at)
-            at += CONSECUTIVE_LAGS
-        first.extend(range(at, end, MAX_LAGS))
-        if (end - at) % MAX_LAGS == 1 and end - at > MAX_LAGS:
-            first[-1] -= 1  # two and a few rather than one alone
-    return np.array([*first, shifts.size])
+    at, end = 0, ks.size
+    while (
+        at + CONSECUTIVE_LAGS <= end
+        and ks[at + CONSECUTIVE_LAGS - 1] - ks[at] == CONSECUTIVE_LAGS - 1
+    ):
+        first.append(at)
+        at += CONSECUTIVE_LAGS
+    first.extend(range(at, end, MAX_LAGS))
+    if (end - at) % MAX_LAGS == 1 and end - at > MAX_LAGS:
+        first[-1] -= 1  # two and a few rather than one alone
+    return np.array([*first, end])
 
 
 @njit(**INNER)
 def _limit_terms(i, count, first, high, stop, block, cut, splits, sizes):  # type: ignore[no-untyped-def]
     """Count the terms of head, and of head and tail, of `count` factors from number i on."""
-    step, ks, shifts, head_lengths, whole_blocks, n_windows = cut
-    shift = shifts[i]
-    up = (1 << shift) - 1
+    step, ks, head_lengths, whole_blocks, n_windows = cut
     a = block * step
     largest = 0
     for q in range(count):
         split = a + head_lengths[i + q]
         last = n_windows + whole_blocks[i + q] - 1
         end = split if block == last or whole_blocks[i + q] == 0 else a + step
-        end = ((min(end, high, stop - 2 * ks[i + q]) + up) >> shift) - first
+        end = min(end, high, stop - 2 * ks[i + q]) - first
         sizes[q] = end if end > 0 and block <= last else 0
-        splits[q] = min(sizes[q], max(0, ((split + up) >> shift) - first))
+        splits[q] = min(sizes[q], max(0, split - first))
         largest = max(largest, sizes[q])
     return largest
 
 
 @njit(**INNER)
 def _add_stretch(  # type: ignore[no-untyped-def]
-    flat, places, base, starts, stops, begin, end, tile, cut, lags, groups, first_runs, splits,
-    sizes, out,
-):  # fmt: skip
+    flat, base, starts, stops, begin, end, tile, cut, groups, first_runs, splits, sizes, out
+):
     """Add the terms of the blocks from `begin` to `end`, from sample `tile` of each block on.
 
     At most `_STRETCH_POINTS` samples of each block are used; `first_runs` holds the first runs in
     reach.
     """
-    step, ks, shifts = cut.step, cut.ks, cut.shifts
+    step, ks = cut.step, cut.ks
     heads, tails = out[0].reshape(-1), out[1].reshape(-1)
     # No slice of an array and no new array in these loops: each costs as much as a hundred terms.
     for g in range(groups.size - 1):
         i = groups[g]
         count = groups[g + 1] - i
-        shift = shifts[i]
         for block in range(begin, end):
             low = block * step + tile
             high = min(low + _STRETCH_POINTS, (block + 1) * step)
@@ -114,10 +106,10 @@ def _add_stretch(  # type: ignore[no-untyped-def]
             for r in range(first_runs[g], stops.size):
                 if starts[r] >= high:
                     break
-                first = (max(low, starts[r]) + (1 << shift) - 1) >> shift
+                first = max(low, starts[r])
                 if _limit_terms(i, count, first, high, stops[r], block, cut, splits, sizes):
-                    place, row = places[i] + first - (base >> shift), block * ks.size + i
-                    split_sums(flat, place, count, lags, i, splits, sizes, heads, tails, row)
+                    place, row = first - base, block * ks.size + i
+                    split_sums(flat, place, count, ks, i, splits, sizes, heads, tails, row)
                     if out.shape[0] > 2:
                         for q in range(count):
                             out[2, block, i + q] += splits[q]
@@ -125,27 +117,19 @@ def _add_stretch(  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _move_to_front(flat, capacity, levels, by, held):  # type: ignore[no-untyped-def]
-    """Move the points from `by` to `held` to the beginning of `flat`, on every thinned level."""
-    place, size = 0, capacity
-    for level in range(levels + 1):
-        shift = np.int64(by >> level)
-        part = flat[place : place + ((held - 1) >> level) + 1]
-        for m in range(part.size - shift):
-            part[m] = part[m + shift]
-        place += size
-        size = (size + 1) // 2
+def _move_to_front(flat, by, held):  # type: ignore[no-untyped-def]
+    """Move the points from `by` to `held` to the beginning of `flat`."""
+    for m in range(held - by):
+        flat[m] = flat[m + by]
 
 
-def held_points(n_points: int, step: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]) -> int:
+def held_points(n_points: int, step: int, ks: NDArray[np.int64]) -> int:
     """Find how many points of the angle `grouped_blocks` keeps: twice the reach of its terms."""
-    unit = 1 << int(shifts.max(initial=0))
-    needed_points = 4 * int(ks[-1]) + 2 * max(step, _STRETCH_POINTS) + TILE + unit
-    return -(-min(needed_points, n_points) // unit) * unit
+    return min(4 * int(ks[-1]) + 2 * max(step, _STRETCH_POINTS) + TILE + 1, n_points)
 
 
 @njit(**KERNEL)
-def grouped_blocks(x, offset, flat, capacity, places, starts, stops, cut, groups, out):  # type: ignore[no-untyped-def]
+def grouped_blocks(x, offset, flat, capacity, starts, stops, cut, groups, out):  # type: ignore[no-untyped-def]
     """Sum heads and tails of every block and averaging factor, and count their terms.
 
     The angle is integrated as the blocks need it, and only as much of it is held as fits in the
@@ -157,13 +141,12 @@ def grouped_blocks(x, offset, flat, capacity, places, starts, stops, cut, groups
         Rates, or empty if `flat` already holds the angle.
     offset : float
         Subtracted from each rate.
-    flat, capacity, places : float64, int, int64 (n_tau,)
-        Buffer for `capacity` points of the angle (see `held_points`) and their thinned levels (see
-        `pyramid_places`); start of the level of each averaging factor.
+    flat, capacity : float64, int
+        Buffer for `capacity` points of the angle (see `held_points`), of `padded_size` elements.
     starts, stops : int64 (n_runs,)
         Runs of present points of the angle, one more each than of present rates.
     cut : Cut
-        Blocks; `flat` holds the angle thinned by ``2**shift``.
+        Blocks.
     groups : int64 (n_groups + 1,)
         Result of `group_factors`.
     out : float64 (2 or 4, n_blocks, n_tau)
@@ -174,16 +157,14 @@ def grouped_blocks(x, offset, flat, capacity, places, starts, stops, cut, groups
     float
         Largest magnitude of the angle that was integrated.
     """
-    n_blocks, step, ks, shifts = out.shape[1], cut.step, cut.ks, cut.shifts
+    n_blocks, step, ks = out.shape[1], cut.step, cut.ks
     first_runs, ends = np.zeros(groups.size, np.int64), stops - 1
-    lags = ks >> shifts
     splits, sizes = np.empty(CONSECUTIVE_LAGS, np.int64), np.empty(CONSECUTIVE_LAGS, np.int64)
-    levels, together = shifts[-1], max(1, _STRETCH_POINTS // step)
+    together = max(1, _STRETCH_POINTS // step)
     base = done = run = np.int64(0)
     total = largest = 0.0
     if x.size > 0:
         flat[0] = 0.0
-        thin_pyramid(flat, capacity, levels, base, base + 1)
     for begin in range(0, n_blocks, together):
         end = min(begin + together, n_blocks)
         out[:, begin:end] = 0.0
@@ -193,18 +174,16 @@ def grouped_blocks(x, offset, flat, capacity, places, starts, stops, cut, groups
             while done < needed:
                 b = min(done + TILE, x.size)
                 if b + 1 - base > capacity:
-                    by = (first >> levels << levels) - base
-                    _move_to_front(flat, capacity, levels, by, done + 1 - base)
-                    base += by
+                    _move_to_front(flat, first - base, done + 1 - base)
+                    base = first
                 total, reached, run = integrate_tile(
                     x, offset, starts, ends, done, b, total, run, flat[done - base : b + 1 - base]
                 )
                 largest = max(largest, reached)
-                thin_pyramid(flat, capacity, levels, done + 1 - base, b + 1 - base)
                 done = b
             _add_stretch(
-                flat, places, base, starts, stops, begin, end, tile, cut, lags, groups, first_runs,
-                splits, sizes, out,
+                flat, base, starts, stops, begin, end, tile, cut, groups, first_runs, splits, sizes,
+                out,
             )  # fmt: skip
     return largest
 
@@ -246,14 +225,3 @@ def windows_from_blocks(heads, tails, whole_blocks, out):  # type: ignore[no-unt
                 for i in range(first, stop):
                     out[j, i] = heads[j, i]
         first = stop
-
-
-def full_counts(
-    lengths: NDArray[np.int64], step: int, n_windows: int, shifts: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Count the terms of each window without gaps, (n_windows, n_tau), or of all, (1, n_tau)."""
-    if not shifts.any():
-        return lengths.astype(np.float64)[None]
-    up = (1 << shifts) - 1
-    first = step * np.arange(n_windows)[:, None] + up
-    return (((first + lengths) >> shifts) - (first >> shifts)).astype(np.float64)

@@ -29,16 +29,14 @@ _SECTION = 8
 _GOLDEN = 0.6180339887498949
 
 
-def cluster_strides(
-    window: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Choose the distance of the pairs of clusters, a power of two and at least `2**shift`.
+def cluster_strides(window: int, ks: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Choose the distance of the pairs of clusters, a power of two.
 
     Pairs closer than k/16 add almost no information if many of them fit the window; if 256 or fewer
     do, all are used.
     """
     largest = np.maximum(np.minimum(ks // 16, (window - 2 * ks + 1) // 256), 1)
-    return np.maximum(2 ** np.floor(np.log2(largest)).astype(np.int64), 2**shifts).astype(np.int64)
+    return np.asarray(2 ** np.floor(np.log2(largest)).astype(np.int64))
 
 
 @intrinsic

@@ -1,4 +1,4 @@
-"""From samples to the angle: runs of present samples, sums per block, the integral, thinned levels.
+"""From samples to the angle: runs of present samples, sums per block, the integral.
 
 Missing samples never enter an inner loop: only if a sum is not finite are its samples checked one
 by one. After that, all work is on runs of present samples.
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gyrostab.kernels.allan.plain_sums import LANES, MAX_LAGS
 from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
 
-#: Samples that are integrated, measured and thinned while they are in the cache.
+#: Samples that are integrated and measured while they are in the cache.
 TILE = 4096
 # Samples that are looked at one by one where some of them are missing.
 _LOOK = 512
@@ -148,21 +148,6 @@ def _find_largest(theta):  # type: ignore[no-untyped-def]
     return largest.view(np.float64)[0]
 
 
-@njit(**KERNEL)
-def thin_pyramid(flat, n_points, levels, a, b):  # type: ignore[no-untyped-def]
-    """Copy every second point of ``flat[a:b]`` to the next level, level by level."""
-    place = 0
-    size = n_points
-    for _ in range(levels):
-        a, b = (a + 1) // 2, (b + 1) // 2
-        source = flat[place + 2 * a : place + min(size, 2 * b)]
-        target = flat[place + size + a : place + size + b]
-        for i in range(np.uint64(target.size)):
-            target[i] = source[np.uint64(2) * i]
-        place += size
-        size = (size + 1) // 2
-
-
 @njit(**INNER)
 def integrate_tile(x, offset, starts, stops, a, b, total, run, theta):  # type: ignore[no-untyped-def]
     """Integrate ``x - offset`` from a to b over the runs from number `run` on; gaps add nothing.
@@ -265,25 +250,11 @@ def needs_two_doubles(largest: float, x: NDArray[np.generic]) -> bool:
     return bool(change.size > 0 and largest > _PLAIN * np.median(change))
 
 
-def pyramid_places(
-    n_points: int, ks: NDArray[np.int64], shifts: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], int]:
-    """Find where ``theta[:: 2**shift]`` of every shift begins in one array, and its size.
+def padded_size(n_points: int, ks: NDArray[np.int64]) -> int:
+    """Find the size of an array for `n_points` and what `split_sums` reads and ignores behind them.
 
-    The array has extra elements at its end, which `gyrostab.kernels.allan.vectors.split_sums` reads
-    and ignores: it reads as far with the longest of its lags as with the shortest.
+    `gyrostab.kernels.allan.vectors.split_sums` reads as far with the longest of its lags as with
+    the shortest.
     """
-    apart = 0
-    for i in range(ks.size):
-        apart = max(apart, ks[i] - ks[max(0, i - MAX_LAGS + 1)])
-    begin = np.zeros(shifts.size, np.int64)
-    place = 0
-    size = n_points
-    shift = 0
-    for i in range(shifts.size):
-        while shift < shifts[i]:
-            place += size
-            size = (size + 1) // 2
-            shift += 1
-        begin[i] = place
-    return begin, int(place + size + 2 * apart + 2 * LANES)
+    shortest = np.concatenate([np.repeat(ks[:1], MAX_LAGS - 1), ks])[: ks.size]
+    return n_points + 2 * int((ks - shortest).max()) + 2 * LANES

@@ -125,35 +125,32 @@ def _energy_two(high, low, a, b, k, order):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _sum_part(high, low, begin, end, first_interval, a, b, k, shift, order):  # type: ignore[no-untyped-def]
+def _sum_part(high, low, begin, end, first_interval, a, b, k, order):  # type: ignore[no-untyped-def]
     """Sum and count the valid terms in ``a <= m < b``; `first_interval` ends first after a."""
-    up = (1 << shift) - 1
     total, count = 0.0, 0
     for v in range(first_interval, begin.size):
         if begin[v] >= b:
             break
-        first = (max(begin[v], a) + up) >> shift
-        last = (min(end[v], b) + up) >> shift
+        first, last = max(begin[v], a), min(end[v], b)
         if last > first:
             count += last - first
             if low.size > 0:
-                total += _energy_two(high, low, first, last, k >> shift, order)
+                total += _energy_two(high, low, first, last, k, order)
             else:
-                total += _sum_squares(high, first, last, k >> shift, order)
+                total += _sum_squares(high, first, last, k, order)
     return total, count
 
 
 @njit(**KERNEL)
-def single_blocks(high, low, places, starts, stops, order, spans, points, cut):  # type: ignore[no-untyped-def]
+def single_blocks(high, low, starts, stops, order, spans, points, cut):  # type: ignore[no-untyped-def]
     """Sum heads and tails as `grouped_blocks`; `low` is the remainder of `high`, or empty.
 
     `order` is that of the differences; `spans` (n_tau,) and `points` as for `valid_intervals`.
     """
-    step, ks, shifts, head_lengths, whole_blocks, n_windows = cut
+    step, ks, head_lengths, whole_blocks, n_windows = cut
     out = np.zeros((4, n_windows + whole_blocks[0], ks.size))
     for i in range(ks.size):
         begin, end = valid_intervals(starts, stops, ks[i], spans[i], points)
-        theta, remainder = high[places[i] :], low[places[i] :]
         last = n_windows + whole_blocks[i] - 1
         first_interval = 0
         for block in range(last + 1):
@@ -162,7 +159,7 @@ def single_blocks(high, low, places, starts, stops, order, spans, points, cut): 
                 first_interval += 1
             for half in range(2 if whole_blocks[i] > 0 and block < last else 1):
                 out[half, block, i], out[2 + half, block, i] = _sum_part(
-                    theta, remainder, begin, end, first_interval, edges[half], edges[half + 1],
-                    ks[i], shifts[i], order,
+                    high, low, begin, end, first_interval, edges[half], edges[half + 1], ks[i],
+                    order,
                 )  # fmt: skip
     return out

@@ -73,7 +73,7 @@ def _pair_sum(n, k, moments):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def strict_gap_factors(begin, end, counts, full, k, shift, length, step, order, summed):  # type: ignore[no-untyped-def]
+def strict_gap_factors(begin, end, counts, full, k, length, step, order, summed):  # type: ignore[no-untyped-def]
     """Degrees of freedom of each window with gaps, as a share of the gap-free window's.
 
     Parameters
@@ -82,9 +82,8 @@ def strict_gap_factors(begin, end, counts, full, k, shift, length, step, order, 
         Valid intervals of m of a rate log.
     counts, full : int64 (n_windows,)
         Terms used and terms without gaps.
-    k, shift, length, step : int
-        Averaging factor, thinning of the terms (every ``2**shift``-th), terms of a window without
-        thinning, and step [samples].
+    k, length, step : int
+        Averaging factor, terms of a window without gaps, and step [samples].
     order, summed : int, bool
         Order of the differences; whether they are those of the running sum of the angle.
 
@@ -93,8 +92,7 @@ def strict_gap_factors(begin, end, counts, full, k, shift, length, step, order, 
     float64 (n_windows,)
         1 where nothing is missing, 0 where nothing is left.
     """
-    moments = np.empty((2, 0)) if order == 2 else _third_pair_moments(k >> shift, summed)
-    up = (1 << shift) - 1
+    moments = np.empty((2, 0)) if order == 2 else _third_pair_moments(k, summed)
     out = np.ones(counts.size)
     v = 0
     for j in range(counts.size):
@@ -110,9 +108,8 @@ def strict_gap_factors(begin, end, counts, full, k, shift, length, step, order, 
         for u in range(v, begin.size):
             if begin[u] >= first + length:
                 break
-            a = (max(begin[u], first) + up) >> shift
-            b = (min(end[u], first + length) + up) >> shift
-            pairs += _pair_sum(b - a, k >> shift, moments)
+            a, b = max(begin[u], first), min(end[u], first + length)
+            pairs += _pair_sum(b - a, k, moments)
         ratio = counts[j] / full[j]
-        out[j] = ratio * ratio * _pair_sum(int(full[j]), k >> shift, moments) / pairs
+        out[j] = ratio * ratio * _pair_sum(int(full[j]), k, moments) / pairs
     return out

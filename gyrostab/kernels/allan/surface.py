@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.allan.blocks import (
     Cut,
-    full_counts,
     group_factors,
     grouped_blocks,
     held_points,
@@ -30,10 +29,9 @@ from gyrostab.kernels.allan.integrate import (
     integrate,
     integrate_two,
     needs_two_doubles,
+    padded_size,
     present_runs,
-    pyramid_places,
     sum_two,
-    thin_pyramid,
 )
 from gyrostab.kernels.allan.intervals import single_blocks, valid_intervals
 from gyrostab.kernels.allan.pairs import strict_gap_factors
@@ -57,9 +55,8 @@ class Unit(NamedTuple):
     ----------
     window, step : int
         Window and step [samples].
-    ks, shifts : int64 (n_tau,)
-        Averaging factors, rising, and the powers of two that thin their second differences, not
-        falling.
+    ks : int64 (n_tau,)
+        Averaging factors, rising.
     angle : bool
         The samples are cumulative angles, ``window + 1`` per window, instead of rates.
     interval : float
@@ -73,7 +70,6 @@ class Unit(NamedTuple):
     window: int
     step: int
     ks: NDArray[np.int64]
-    shifts: NDArray[np.int64]
     angle: bool
     interval: float
     min_strict: float
@@ -118,7 +114,7 @@ class Cells(NamedTuple):
 
 @njit(**KERNEL)
 def _share_gaps(  # type: ignore[no-untyped-def]
-    starts, stops, angle, window, step, ks, shifts, spans, order, summed, counts, full, cells
+    starts, stops, angle, window, step, ks, spans, order, summed, counts, full, cells
 ):
     """Degrees of freedom of the strict cells, as a share of the gap-free ones."""
     for i in range(ks.size):
@@ -129,7 +125,7 @@ def _share_gaps(  # type: ignore[no-untyped-def]
         begin, end = valid_intervals(starts, stops, ks[i], spans[i], np.int64(0))
         length = window - spans[i] + 1
         factors = strict_gap_factors(
-            begin, end, counts[:, i], full[:, i], ks[i], shifts[i], length, step, order, summed
+            begin, end, counts[:, i], full[:, i], ks[i], length, step, order, summed
         )
         for j in range(factors.size):
             cells[3, j, i] = factors[j]
@@ -166,7 +162,7 @@ def _strict_sums(work: _Work, gaps: bool) -> tuple[Floats, Floats]:
     blocks = space.array("blocks", 4 if gaps else 2, n_windows + int(whole_blocks[0]), unit.ks.size)
     has_intervals = unit.order == 3 or (unit.angle and work.starts.size > 1)
     add = _interval_blocks if has_intervals else _grouped_blocks
-    add(work, Cut(unit.step, unit.ks, unit.shifts, head_lengths, whole_blocks, n_windows), blocks)
+    add(work, Cut(unit.step, unit.ks, head_lengths, whole_blocks, n_windows), blocks)
     sums = space.array("sums", len(blocks) // 2, n_windows, unit.ks.size)
     for heads_and_tails, out in zip((blocks[:2], blocks[2:]), sums, strict=False):
         windows_from_blocks(*heads_and_tails, whole_blocks, out)
@@ -176,17 +172,14 @@ def _strict_sums(work: _Work, gaps: bool) -> tuple[Floats, Floats]:
 def _grouped_blocks(work: _Work, cut: Cut, blocks: Floats) -> None:
     """Sum heads and tails of rates, or of angles without gaps."""
     x, unit, space, _, starts, stops, offset = work
-    ks, shifts = unit.ks, unit.shifts
-    points = x.size if unit.angle else held_points(x.size + 1, unit.step, ks, shifts)
-    places, size = pyramid_places(points, ks, shifts)
-    flat = space.array("angle", size)
+    points = x.size if unit.angle else held_points(x.size + 1, unit.step, unit.ks)
+    flat = space.array("angle", padded_size(points, unit.ks))
     if unit.angle:
         flat[:points] = _line_removed(work)
-        thin_pyramid(flat, points, int(shifts[-1]), 0, points)
         x, offset = np.empty(0), 0.0
     runs = starts, stops + (not unit.angle)
-    groups = group_factors(ks, shifts)
-    largest = grouped_blocks(x, offset, flat, points, places, *runs, cut, groups, blocks)
+    groups = group_factors(unit.ks)
+    largest = grouped_blocks(x, offset, flat, points, *runs, cut, groups, blocks)
     if not unit.angle and needs_two_doubles(largest, x):
         _interval_blocks(work, cut, blocks)
 
@@ -208,9 +201,9 @@ def _angle_of(work: _Work, windows: Integers) -> Floats:
 def _interval_blocks(work: _Work, cut: Cut, blocks: Floats) -> None:
     """Sum heads and tails interval by interval; a sum of the angle is held as two doubles."""
     x, unit, space, _, starts, stops, offset = work
-    ks, shifts, summed = unit.ks, unit.shifts, VARIANCES[unit.variance].summed
+    summed = VARIANCES[unit.variance].summed
     angles = x.size if unit.angle else x.size + 1
-    places, size = pyramid_places(angles + summed, ks, shifts)
+    size = angles + summed
     high, low = space.array("angle", size), space.array("rest of the angle", size)
     precise = summed
     if unit.angle:
@@ -221,15 +214,13 @@ def _interval_blocks(work: _Work, cut: Cut, blocks: Floats) -> None:
             integrate_two(x, offset, starts, stops, high[:angles], low[:angles])
     if summed:
         high[angles] = low[angles] = 0.0
-        sum_two(high[: angles + 1], low[: angles + 1])
+        sum_two(high, low)
     if precise:
-        align_two(high[: angles + summed], low[: angles + summed])
-    for part in (high, low) if precise else (high,):
-        thin_pyramid(part, angles + summed, int(shifts[-1]), 0, angles + summed)
+        align_two(high, low)
     spans = unit.spans + unit.angle  # of angles instead of samples
     terms = (unit.order, spans, unit.points)
     low = low if precise else low[:0]
-    blocks[:] = single_blocks(high, low, places, starts, stops, *terms, cut)[: len(blocks)]
+    blocks[:] = single_blocks(high, low, starts, stops, *terms, cut)[: len(blocks)]
 
 
 def convert_to_native(x: NDArray[np.generic]) -> NDArray[np.floating[Any]]:
@@ -272,7 +263,7 @@ def surface_unit(
     offset = float(np.rint(mean)) if counts_only else mean
     work = _Work(x, unit, space, n_windows, starts, stops, offset)
     sums, counts = _strict_sums(work, gaps)
-    full = full_counts(unit.lengths, unit.step, n_windows, unit.shifts)
+    full = unit.lengths.astype(np.float64)[None]
     scale = VARIANCES[unit.variance].divisors(unit.ks) * (unit.interval if unit.angle else 1.0) ** 2
     if gaps:
         full = np.ascontiguousarray(np.broadcast_to(full, counts.shape))
@@ -299,9 +290,8 @@ def _cells_with_gaps(work: _Work, sums: Floats, counts: Floats, full: Floats) ->
     cells[1], cells[2], cells[4] = counts, counts / full, STRICT
     order = (unit.spans, unit.order, VARIANCES[unit.variance].summed)
     _share_gaps(
-        starts, stops, unit.angle, unit.window, unit.step, unit.ks, unit.shifts, *order, counts,
-        full, cells,
-    )  # fmt: skip
+        starts, stops, unit.angle, unit.window, unit.step, unit.ks, *order, counts, full, cells
+    )
     cells[8] = _find_slopes(work, counts < full)
     poor = counts < unit.min_strict * full
     if unit.order == 2 and not unit.angle and poor.any():
@@ -318,7 +308,7 @@ def _bridge_gaps(work: _Work, theta: Floats, poor: NDArray[np.bool_], cells: Flo
     """Weighted clusters where too few terms are left (rate logs only)."""
     unit, runs = work.unit, (work.starts, work.stops, theta.size - 1)
     mask = pack_mask(*runs)
-    strides = cluster_strides(unit.window, unit.ks, unit.shifts)
+    strides = cluster_strides(unit.window, unit.ks)
     places = integrate_places(*runs)
     for i in np.flatnonzero(poor.any(axis=0)):
         rows = np.ascontiguousarray(poor[:, i])

@@ -133,8 +133,8 @@ def _add_steps(window, n1, n2, k1, k2, order, first, scale, logarithm, crossed, 
 
 
 @njit(**INNER)
-def _add_points(n1, n2, k1, k2, order, thin, scale, logarithm, crossed, r, products, means):  # type: ignore[no-untyped-def]
-    """Add the pairs of white angle noise with every term, times `thin`.
+def _add_points(n1, n2, k1, k2, order, scale, logarithm, crossed, r, products, means):  # type: ignore[no-untyped-def]
+    """Add the pairs of white angle noise with every term.
 
     They have a covariance only where points of both differences coincide: at 9 or 16 lags at most.
     """
@@ -144,7 +144,7 @@ def _add_points(n1, n2, k1, k2, order, thin, scale, logarithm, crossed, r, produ
         is_repeated = False
         for q in range(p):
             is_repeated = is_repeated or lag == (q // points) * k1 - (q % points) * k2
-        weight = _count_pairs(lag, n1, n2) * thin
+        weight = _count_pairs(lag, n1, n2)
         if is_repeated or weight == 0:
             continue
         if order == 2:
@@ -218,7 +218,7 @@ def _add_every(window, k1, k2, zero, differences, products, means):  # type: ign
 
 @njit(**INNER)
 def _sum_pairs(  # type: ignore[no-untyped-def]
-    window, k1, k2, order, thin, summed, logarithm, zero, differences, crossed, r, products, means
+    window, k1, k2, order, summed, logarithm, zero, differences, crossed, r, products, means
 ):
     """Average the products ``r_a r_b`` and values ``r_a`` over all pairs of terms, k1 <= k2."""
     products[:] = 0.0
@@ -233,7 +233,7 @@ def _sum_pairs(  # type: ignore[no-untyped-def]
             window, n1, n2, k1, k2, order, first, scale, logarithm, crossed, r, products, means
         )
     if not summed:
-        _add_points(n1, n2, k1, k2, order, thin, scale, logarithm, crossed, r, products, means)
+        _add_points(n1, n2, k1, k2, order, scale, logarithm, crossed, r, products, means)
     pairs = float(n1) * n2
     for a in range(STOCHASTIC):
         means[a] /= pairs
@@ -248,7 +248,7 @@ def _reached_lags(window, longest):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def _fill_tables(window, ks, shifts, order, summed, diagonal, logarithm, table):  # type: ignore[no-untyped-def]
+def _fill_tables(window, ks, order, summed, diagonal, logarithm, table):  # type: ignore[no-untyped-def]
     """Fill `product_tables`, or only the diagonals (4, 4, n_tau, 1) and (4, n_tau, 1).
 
     Second differences need `logarithm`, third ones `table`; the other one may have any size.
@@ -272,9 +272,8 @@ def _fill_tables(window, ks, shifts, order, summed, diagonal, logarithm, table):
         elif differences.size:
             _difference_covariances(ks[i], zero, logarithm, differences)
         for j in range(i, last):
-            thin = 1 << min(shifts[i], shifts[j])
             _sum_pairs(
-                window, ks[i], ks[j], order, thin, summed, logarithm, zero, differences, crossed, r,
+                window, ks[i], ks[j], order, summed, logarithm, zero, differences, crossed, r,
                 pair_products, mean,
             )  # fmt: skip
             at, mirrored = (i, 0) if diagonal else (i, j), (i, 0) if diagonal else (j, i)
@@ -289,7 +288,6 @@ def _fill_tables(window, ks, shifts, order, summed, diagonal, logarithm, table):
 def product_tables(
     window: int,
     ks: NDArray[np.int64],
-    shifts: NDArray[np.int64],
     *,
     variance: str = "avar",
     diagonal: bool = False,
@@ -302,8 +300,6 @@ def product_tables(
         Samples of the window; averaging factor k has ``window - span + 1`` terms.
     ks : int64 (n_tau,)
         Averaging factors, rising, with spans up to the window.
-    shifts : int64 (n_tau,)
-        Thinning of the terms (every ``2**shift``-th is used).
     variance : str
         One of `gyrostab.kernels.allan.variances.VARIANCES`.
     diagonal : bool
@@ -320,7 +316,7 @@ def product_tables(
     order, summed = VARIANCES[variance].order, VARIANCES[variance].summed
     logarithm = _log_lags(window, int(ks[-1])) if order == 2 else np.empty(0)
     table = autocovariances(window + 2 if order == 3 else 1, summed=summed)
-    products, means = _fill_tables(window, ks, shifts, order, summed, diagonal, logarithm, table)
+    products, means = _fill_tables(window, ks, order, summed, diagonal, logarithm, table)
     factors = ks.astype(np.float64)
     # a third difference of the angle does not see a ramp
     scale = 2.0 * float(order == 2 or summed) * factors[:, None]

@@ -7,8 +7,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
-from gyrostab.kernels.fit.lanes import PLACES, eights, number, put, take, take_four, where_above
-from gyrostab.kernels.fit.mixture import PRODUCTS, sum_products
 
 
 def combine_diagonal(pairs: NDArray[np.float64], ramps: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -23,8 +21,9 @@ def combine_diagonal(pairs: NDArray[np.float64], ramps: NDArray[np.float64]) -> 
 @njit(**INNER)
 def degrees_of_freedom(squares, curves, w, columns, to_samples, diagonal, out):  # type: ignore[no-untyped-def]
     """Compute the degrees of freedom of each finite cell of window w, ``2 mean^2 / variance``."""
-    avar, white, quantization = curves.avar[w], curves.white[w], curves.quantization[w]
-    ramp, factor = curves.ramp[w], curves.factor[w]
+    row = min(w, curves.white.shape[0] - 1)
+    avar, white, quantization = curves.avar[w], curves.white[row], curves.quantization[row]
+    ramp, factor = curves.ramp[row], curves.factor[row]
     amounts = np.empty(5)
     for i in range(avar.size):
         if not np.isfinite(avar[i]):
@@ -46,34 +45,6 @@ def degrees_of_freedom(squares, curves, w, columns, to_samples, diagonal, out): 
         out[i] = 2.0 * mean * mean / variance * factor[i] if variance > 0.0 else 0.0
 
 
-@njit(**INNER)
-def _whole_degrees_of_freedom(squares, columns, to_samples, diagonal, freedom, out):  # type: ignore[no-untyped-def]
-    """Compute the degrees of freedom of the cells of up to eight windows without gaps.
-
-    `squares` holds their squared coefficients (row ``term``), `freedom` is scratch; tables are
-    flat.
-    """
-    s0, s1, s2, s3 = take_four(squares, np.int64(0), np.int64(1))
-    s4 = take(squares, 4)
-    a0 = s0 * number(to_samples, 0)
-    a1 = s1 * number(to_samples, 1)
-    a2 = s2 * number(to_samples, 2)
-    a3 = s3 * number(to_samples, 3)
-    a4 = s4 * number(to_samples, 4)
-    for i in range(out.shape[1]):
-        mean = (
-            s0 * number(columns, 5 * i)
-            + s1 * number(columns, 5 * i + 1)
-            + s2 * number(columns, 5 * i + 2)
-            + s3 * number(columns, 5 * i + 3)
-            + s4 * number(columns, 5 * i + 4)
-        )
-        variance = sum_products(diagonal, PRODUCTS * i, a0, a1, a2, a3, a4)
-        put(freedom, 0, where_above(variance, 0.0, 2.0 * mean * mean / variance, 0.0))
-        for place in range(out.shape[0]):
-            out[place, i] = freedom[0, place]
-
-
 @njit(**KERNEL)
 def cell_freedoms(squares, curves, columns, to_samples, diagonal):  # type: ignore[no-untyped-def]
     """Compute the degrees of freedom of each cell from the squared coefficients of its window.
@@ -93,26 +64,11 @@ def cell_freedoms(squares, curves, columns, to_samples, diagonal):  # type: igno
         NaN without a variance above zero.
     """
     avar = curves.avar
-    n_windows, n_tau = avar.shape
     out = np.empty(avar.shape)
-    if curves.white.shape[0] == n_windows:
-        for w in range(n_windows):
-            degrees_of_freedom(squares[w], curves, w, columns, to_samples, diagonal, out[w])
-    else:
-        eight_squares, lanes = eights(np.int64(5)), eights(np.int64(1))
-        columns = columns.ravel()
-        diagonal = diagonal.ravel()
-        for start in range(0, n_windows, PLACES):
-            count = min(PLACES, n_windows - start)
-            for place in range(count):
-                for a in range(5):
-                    eight_squares[a, place] = squares[start + place, a]
-            _whole_degrees_of_freedom(
-                eight_squares, columns, to_samples, diagonal, lanes, out[start : start + count]
-            )
-    for w in range(n_windows):
+    for w in range(avar.shape[0]):
+        degrees_of_freedom(squares[w], curves, w, columns, to_samples, diagonal, out[w])
         shares = curves.factor[min(w, curves.factor.shape[0] - 1)]
-        for i in range(n_tau):
+        for i in range(avar.shape[1]):
             if not (avar[w, i] > 0.0 and avar[w, i] < np.inf and shares[i] > 0.0):
                 out[w, i] = np.nan
     return out

@@ -6,80 +6,38 @@ The solution is exact: of five terms there are at most 31 subsets, and all are t
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from numpy.typing import NDArray
 
-from gyrostab.kernels.compiled import INNER, KERNEL
-
-
-@njit(**INNER)
-def _solve_subset(normal, right, subset, solution, work, members):  # type: ignore[no-untyped-def]
-    """Solve the normal equations for the terms in the bit set `subset`; False if singular.
-
-    `solution` is zero for the other terms; `work` (n, n) and `members` (n,) are scratch.
-    """
-    n = 0
-    for i in range(members.size):
-        if subset >> i & 1:
-            members[n] = i
-            n += 1
-    solution[:] = 0.0
-    for i in range(n):  # Cholesky factor and forward solution, row by row
-        for j in range(i):
-            total = normal[members[i], members[j]]
-            for p in range(j):
-                total -= work[i, p] * work[j, p]
-            work[i, j] = total / work[j, j]
-        pivot = normal[members[i], members[i]] * (1.0 + 1e-12)
-        total = right[members[i]]
-        for p in range(i):
-            pivot -= work[i, p] * work[i, p]
-            total -= work[i, p] * solution[members[p]]
-        if not pivot > 0.0:
-            return False
-        work[i, i] = np.sqrt(pivot)
-        solution[members[i]] = total / work[i, i]
-    for i in range(n - 1, -1, -1):
-        for p in range(i + 1, n):
-            solution[members[i]] -= work[p, i] * solution[members[p]]
-        solution[members[i]] /= work[i, i]
-    return True
+Array = NDArray[np.float64]
 
 
-@njit(**KERNEL)
-def solve_nonnegative(normal, right, solution):  # type: ignore[no-untyped-def]
+def solve_nonnegative(normal: Array, right: Array) -> Array:
     """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0``.
 
     Parameters
     ----------
-    normal : float64 (n, n); right : float64 (n,)
+    normal, right : ndarray (n, n), (n,)
         Normal equations.
-    solution : float64 (n,)
-        Overwritten with the minimiser.
+
+    Returns
+    -------
+    ndarray (n,)
+
+    Examples
+    --------
+    >>> solve_nonnegative(np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0]))
+    array([0.5, 0. ])
     """
-    n = right.size
-    room, members = np.empty((2 * n + 3, n)), np.empty(n, np.int64)
-    scaled = room[:n]
-    work = room[n : 2 * n]
-    scale = room[2 * n]
-    scaled_right = room[2 * n + 1]
-    trial = room[2 * n + 2]
-    for i in range(n):
-        scale[i] = 1.0 / np.sqrt(normal[i, i]) if normal[i, i] > 0.0 else 0.0
-    for i in range(n):
-        scaled_right[i] = right[i] * scale[i]
-        for j in range(n):
-            scaled[i, j] = normal[i, j] * scale[i] * scale[j]
-    best = 0.0
-    solution[:] = 0.0
-    for subset in range(1, 1 << n):
-        if not _solve_subset(scaled, scaled_right, subset, trial, work, members):
-            continue
-        gain = 0.0
-        feasible = True
-        for i in range(n):
-            feasible = feasible and trial[i] >= 0.0
-            gain += trial[i] * scaled_right[i]
-        if feasible and gain > best:
-            best = gain
-            for i in range(n):
-                solution[i] = trial[i] * scale[i]
+    solution = np.zeros(right.size)
+    used = np.flatnonzero(np.diagonal(normal) > 0.0)
+    scale = 1.0 / np.sqrt(np.diagonal(normal)[used])
+    scaled_right = right[used] * scale
+    every = np.arange(used.size)
+    members = (np.arange(1 << used.size)[:, None] >> every & 1).astype(np.float64)
+    systems = normal[np.ix_(used, used)] * np.outer(scale, scale)
+    systems = systems * members[:, :, None] * members[:, None, :]
+    systems[:, every, every] = 1.0 + 1e-12  # also of the terms that a subset lacks
+    trials = np.linalg.solve(systems, (members * scaled_right)[..., None])[..., 0]
+    gains = np.where((trials >= 0.0).all(axis=1), trials @ scaled_right, -np.inf)
+    solution[used] = np.abs(trials[gains.argmax()]) * scale  # without a negative zero
+    return solution

@@ -1,4 +1,4 @@
-"""Single kernels of the dynamic Allan variance: integral, thinned levels, lags, reused memory."""
+"""Single kernels of the dynamic Allan variance: integral, lags, reused memory."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gyrostab.kernels.allan.integrate import integrate, present_runs, pyramid_places, thin_pyramid
+from gyrostab.kernels.allan.integrate import integrate, present_runs
 from gyrostab.kernels.allan.plain_sums import CONSECUTIVE_LAGS, LANES
 from gyrostab.kernels.allan.surface import Unit, surface_unit
 from gyrostab.kernels.allan.vectors import split_sums
 from gyrostab.kernels.workspace import Workspace
-from gyrostab.time.durations import thin
 
 
 class TestKernels:
@@ -52,7 +51,7 @@ class TestKernels:
         st.integers(1, 9000),
         st.sampled_from([0.0, 0.001, 0.3, 0.99, 1.0]),
     )
-    def test_integral_and_its_levels(self, seed, n, missing):
+    def test_integral(self, seed, n, missing):
         rng = np.random.default_rng(seed)
         x = rng.integers(-5, 6, n).astype(np.float64)
         x[rng.random(n) < missing] = np.nan
@@ -60,39 +59,25 @@ class TestKernels:
         edges = np.flatnonzero(np.diff(np.concatenate([[False], np.isfinite(x), [False]])))
         np.testing.assert_array_equal(starts, edges[::2])
         np.testing.assert_array_equal(stops, edges[1::2])
-        shifts = np.array([0, 0, 1, 4])
-        places, size = pyramid_places(n + 1, np.array([1, 2, 16, 160]), shifts)
-        flat = np.empty(size)
-        largest = integrate(x, 1.0, starts, stops, flat[: n + 1])
-        thin_pyramid(flat, n + 1, 4, 0, n + 1)
+        angle = np.empty(n + 1)
+        largest = integrate(x, 1.0, starts, stops, angle)
         theta = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(x), x - 1.0, 0.0))])
         assert largest == np.abs(theta).max()
-        for place, shift in zip(places, shifts, strict=True):
-            want = theta[:: 2**shift]
-            np.testing.assert_array_equal(flat[place : place + want.size], want)
+        np.testing.assert_array_equal(angle, theta)
 
     def test_reused_memory_does_not_change_results(self):
         rng, space = np.random.default_rng(4), Workspace()
         whole, broken = rng.standard_normal((2, 30_000))
         broken[rng.random(30_000) < 0.02] = np.nan
         broken[4000] = 1e9  # kept as two doubles
-        for x, angle, octave, n_tau in [
-            (whole, False, False, 60),
-            (broken, False, True, 20),
-            (broken, True, False, 30),
-            (whole, False, True, 9),
+        for x, angle, apart, n_tau in [
+            (whole, False, 1, 60),
+            (broken, False, 8, 20),
+            (broken, True, 1, 30),
+            (whole, False, 8, 9),
         ]:
-            ks = np.arange(1, n_tau + 1) * 8 if octave else np.arange(1, n_tau + 1)
-            unit = Unit(
-                1000,
-                300,
-                ks,
-                thin(ks) if octave else np.zeros_like(ks),
-                angle,
-                0.01,
-                0.3,
-                0.1,
-            )
+            ks = np.arange(1, n_tau + 1) * apart
+            unit = Unit(1000, 300, ks, angle, 0.01, 0.3, 0.1)
             for fresh, used in zip(
                 surface_unit(x, unit), surface_unit(x, unit, space), strict=True
             ):

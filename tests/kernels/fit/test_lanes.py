@@ -39,7 +39,7 @@ def test_plain_numba_gives_the_fit_of_the_vectors(tmp_path):
     avar = (columns @ [0.01, 1e-4, 0.0, 4.0, 0.0]) * rng.chisquare(freedom, (11, 9)) / freedom
     avar[2, 5:] = avar[4] = np.nan
     gaps = [rng.uniform(0.9, 1.1, avar.shape) for _ in range(4)]
-    pairs, ramps = product_tables(window, ks, np.zeros_like(ks))
+    pairs, ramps = product_tables(window, ks)
     diagonal = combine_diagonal(
         np.einsum("abii->abi", pairs).copy(), np.einsum("aii->ai", ramps).copy()
     )

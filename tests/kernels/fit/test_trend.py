@@ -44,7 +44,7 @@ def test_tables_are_those_of_the_quadratic_forms(term):
         rows = weights_of(k)
         forms.append(rows.T @ rows / len(rows) / (2 * k**2) - 0.5 * k**2 * np.outer(slope, slope))
     spread = covariance_of(term)
-    tables = detrend_tables(WINDOW, KS, *product_tables(WINDOW, KS, np.zeros_like(KS)))
+    tables = detrend_tables(WINDOW, KS, *product_tables(WINDOW, KS))
     assert tables.variance[term] == pytest.approx(slope @ spread @ slope, rel=1e-9)
     for i, first in enumerate(forms):
         for j, second in enumerate(forms):
@@ -61,10 +61,8 @@ def test_tables_are_those_of_the_quadratic_forms(term):
 def test_tables_of_a_long_window_need_less_than_100_bytes_a_sample():
     ks = np.array([1, 100, 2**16])
     calls = {
-        "pairs": lambda window: product_tables(window, ks, 0 * ks, diagonal=True),
-        "third": lambda window: product_tables(
-            window, ks, 0 * ks, variance="modified", diagonal=True
-        ),
+        "pairs": lambda window: product_tables(window, ks, diagonal=True),
+        "third": lambda window: product_tables(window, ks, variance="modified", diagonal=True),
         "trend": lambda window: detrend_tables(
             window, ks, np.ones((4, 4, ks.size, ks.size)), np.ones((4, ks.size, ks.size))
         ),

@@ -1,42 +1,26 @@
 """Compare two logs of the same time, with and without an effect, in four panels."""
 
-from __future__ import annotations
-
 import itertools
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
-from numpy.typing import NDArray
 
-from gyrostab.errors import OptionError
-from gyrostab.ingest.convert import as_log
-from gyrostab.ingest.make_log import make_log
+from gyrostab import davar, make_log
 from gyrostab.plot.signal import thin
 from gyrostab.plot.style import (
     COLOURS,
     GREY,
     INCH_MM,
-    NARROW_MM,
-    PAGE_MM,
     draws_figure,
-    is_narrow,
     label_log_axis,
     new_figure,
     unit_label,
 )
 from gyrostab.plot.surface import CHANGE_CMAP
-from gyrostab.schema import signal_name
 from gyrostab.time.durations import duration_seconds
 from gyrostab.units import HOUR
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
-_STYLES: tuple[dict[str, Any], dict[str, Any]] = (
+_WIDTH_MM = 193.04
+_STYLES = (
     {"color": GREY, "lw": 2.4},
     {"color": COLOURS[0], "lw": 1.1},
 )
@@ -44,17 +28,16 @@ _STYLES: tuple[dict[str, Any], dict[str, Any]] = (
 
 @draws_figure
 def plot_comparison(
-    without: xr.Dataset,
-    with_it: xr.Dataset,
+    without,
+    with_it,
     *,
-    window: Any,
-    step: Any = None,
-    moments: Sequence[Any] = (),
-    driver: str = "",
-    difference: bool = False,
-    coherency: bool = False,
-    width: float = PAGE_MM,
-) -> Figure:
+    window,
+    step=None,
+    moments=(),
+    driver="",
+    difference=False,
+    coherency=False,
+):
     """Draw what an effect changes: DAVAR, window means, spectrum, and correlation of two axes.
 
     The first three panels show the first axis, the last one the first two axes.
@@ -62,9 +45,8 @@ def plot_comparison(
     Parameters
     ----------
     without, with_it : xarray.Dataset
-        Two regular logs with ``rate(axis, time)`` [degree hour-1] on the same stamps, for instance
-        simulated with the same seed.
-    window, step : str, float or timedelta
+        Two regular logs with ``rate(axis, time)`` [degree hour-1] on the same stamps.
+    window, step : str
         Windows of the dynamic Allan variance, as for `gyrostab.davar`.
     moments : sequence of float or str
         Times since the start [s] at which to draw the Allan deviation; by default, the ratio over
@@ -77,38 +59,10 @@ def plot_comparison(
         Draw the coherency of the two axes over frequency, in phase and in quadrature. By default,
         draw their Allan correlation over averaging time, ``(avar(x + y) - avar(x - y)) / 4``
         divided by the root of the product of their variances, with its 95 % range by chance.
-    width : float
-        Width of the figure [mm]: 180 for a page, 85 for a column.
-
-    Raises
-    ------
-    SchemaError, OptionError
-        If the inputs are not logs of rates, differ in axes or length, have only one axis, or lack
-        the channel.
-
-    Examples
-    --------
-    >>> from gyrostab.simulate import simulate
-    >>> logs = [simulate({"noise": {"N": n}}, duration="2min", rate=10.0) for n in (0.003, 0.006)]
-    >>> figure = plot_comparison(logs[0].load(), logs[1].load(), window="20s")
-    >>> [panel.get_title() for panel in figure.axes[:3]]
-    ['σ with / σ without, windows of 20 s', 'Window mean', 'Power spectrum']
     """
-    from gyrostab.allan.davar import davar
-
-    logs = without, with_it = as_log(without), as_log(with_it)
-    shapes = {(signal_name(log), tuple(log["axis"].values), log.sizes["time"]) for log in logs}
-    if len(shapes) > 1 or signal_name(without) != "rate" or without.sizes["axis"] < 2:
-        raise OptionError(
-            "plot_comparison needs two logs of rates with the same axes, at least two, and the "
-            f"same number of samples; not {shapes}"
-        )
-    if driver and driver not in with_it:
-        raise OptionError(
-            f"driver {driver!r} is not in the log; it has {', '.join(map(str, with_it.data_vars))}"
-        )
-    figure = new_figure(width / INCH_MM, 7.6 if width < NARROW_MM else 4.9)
-    panels = figure.subplots(*((4, 1) if is_narrow(figure) else (2, 2))).reshape(2, 2)
+    logs = without, with_it
+    figure = new_figure(_WIDTH_MM / INCH_MM, 4.9)
+    panels = figure.subplots(2, 2)
     pair = tuple(
         davar(log, window=window, step=step, taus=30, axis=[str(log["axis"].values[0])])
         .isel(axis=0)
@@ -116,20 +70,11 @@ def plot_comparison(
         for log in logs
     )
     seconds = float(pair[0].attrs["window_s"])
-    name = (
-        f"{seconds / HOUR:g} h"
-        if seconds >= HOUR
-        else f"{seconds / 60:g} min"
-        if seconds >= 600
-        else f"{seconds:g} s"
-    )
+    size, unit = (HOUR, "h") if seconds >= HOUR else (60.0, "min") if seconds >= 600 else (1.0, "s")
+    name = f"{seconds / size:g} {unit}"
     if moments:
-        _draw_curves(
-            panels[0, 0],
-            logs,
-            pair,
-            [duration_seconds(moment, "moment", zero=True) for moment in moments],
-        )
+        times = [duration_seconds(moment, "moment", zero=True) for moment in moments]
+        _draw_curves(panels[0, 0], logs, pair, times)
         panels[0, 0].set_title(f"Allan deviation, windows of {name}")
     else:
         _draw_ratio(panels[0, 0], logs, pair)
@@ -147,7 +92,7 @@ def plot_comparison(
     return figure
 
 
-def _time_since_start(log: xr.Dataset, times: Any) -> tuple[Any, str]:
+def _time_since_start(log, times):
     """Convert times to hours since the start for long logs, else to minutes; with the unit."""
     hour = np.timedelta64(int(HOUR) * 10**9, "ns")
     start, end = log["time"].values[[0, -1]]
@@ -155,7 +100,7 @@ def _time_since_start(log: xr.Dataset, times: Any) -> tuple[Any, str]:
     return (np.asarray(times) - start) / unit, word
 
 
-def _draw_curves(panel: Axes, logs: Any, pair: Any, moments: list[float]) -> None:
+def _draw_curves(panel, logs, pair, moments):
     centres, word = _time_since_start(logs[0], pair[0]["time"].values)
     tau = pair[0]["tau"].values
     panel.loglog(
@@ -174,7 +119,7 @@ def _draw_curves(panel: Axes, logs: Any, pair: Any, moments: list[float]) -> Non
     panel.set(xlabel="averaging time [s]", ylabel="[deg/h]")
 
 
-def _draw_ratio(panel: Axes, logs: Any, pair: Any) -> None:
+def _draw_ratio(panel, logs, pair):
     from matplotlib.colors import LogNorm
 
     centres, word = _time_since_start(logs[0], pair[0]["time"].values)
@@ -183,7 +128,7 @@ def _draw_ratio(panel: Axes, logs: Any, pair: Any) -> None:
     size = np.abs(np.log(ratio[np.isfinite(ratio) & (ratio > 0)]))
     reach = float(np.clip(np.exp(np.quantile(size, 0.995)) if size.size else 1.0, 1.1, 1e3))
     panel.set_facecolor("#d0d0d0")
-    shown: Any = np.ma.masked_invalid(ratio.T)
+    shown = np.ma.masked_invalid(ratio.T)
     mesh = panel.pcolormesh(
         centres,
         pair[0]["tau"].values,
@@ -201,7 +146,7 @@ def _draw_ratio(panel: Axes, logs: Any, pair: Any) -> None:
     bar.set_ticks([1 / tick, 1, tick], labels=[f"1/{tick:g}", "1", f"{tick:g}"])
 
 
-def _draw_means(panel: Axes, logs: Any, pair: Any, *, difference: bool) -> None:
+def _draw_means(panel, logs, pair, *, difference):
     first = pair[0]["window_mean"] if difference else 0.0
     centres, word = _time_since_start(logs[0], pair[0]["time"].values)
     for product, style, label in zip(pair, _STYLES, ("without", "with"), strict=True):
@@ -231,7 +176,7 @@ def _draw_means(panel: Axes, logs: Any, pair: Any, *, difference: bool) -> None:
     panel.legend(framealpha=0.9, edgecolor="none")
 
 
-def _draw_channel(panel: Axes, log: xr.Dataset, driver: str) -> None:
+def _draw_channel(panel, log, driver):
     """Draw a channel behind the window means, on a separate scale."""
     overlay = panel.twinx()
     stamps, low, high = thin(log[driver], columns=400)
@@ -246,7 +191,7 @@ def _draw_channel(panel: Axes, log: xr.Dataset, driver: str) -> None:
     panel.set(zorder=overlay.get_zorder() + 1, facecolor="none")
 
 
-def _interpolate_gaps(log: xr.Dataset) -> tuple[Array, Array]:
+def _interpolate_gaps(log):
     """Interpolate the first two axes over the gaps, for spectra."""
     rows = log["rate"].transpose("axis", "time").values[:2].astype(float)
     for row in rows:
@@ -255,11 +200,11 @@ def _interpolate_gaps(log: xr.Dataset) -> tuple[Array, Array]:
     return rows[0], rows[1]
 
 
-def _draw_spectra(panel: Axes, logs: Any) -> None:
+def _draw_spectra(panel, logs):
     from scipy.signal import welch
 
     for log, style in zip(logs, _STYLES, strict=True):
-        how: dict[str, Any] = {
+        how = {
             "fs": log.attrs["sampling_rate_hz"],
             "nperseg": max(8, log.sizes["time"] // 10),
             "detrend": "linear",
@@ -270,15 +215,15 @@ def _draw_spectra(panel: Axes, logs: Any) -> None:
     panel.set(title="Power spectrum", xlabel="frequency [Hz]", ylabel="[(deg/h)²/Hz]")
 
 
-def _join_axis_names(log: xr.Dataset) -> str:
+def _join_axis_names(log):
     return " and ".join(str(name) for name in log["axis"].values[:2])
 
 
-def _draw_coherency(panel: Axes, logs: Any) -> None:
+def _draw_coherency(panel, logs):
     from scipy.signal import csd, welch
 
     for log, style, quadrature in zip(logs, _STYLES, (GREY, COLOURS[1]), strict=True):
-        how: dict[str, Any] = {
+        how = {
             "fs": log.attrs["sampling_rate_hz"],
             "nperseg": max(8, log.sizes["time"] // 30),
             "detrend": "linear",
@@ -294,9 +239,7 @@ def _draw_coherency(panel: Axes, logs: Any) -> None:
     )
 
 
-def _draw_allan_correlation(panel: Axes, logs: Any) -> None:
-    from gyrostab.allan.davar import davar
-
+def _draw_allan_correlation(panel, logs):
     for log, style in zip(logs, _STYLES, strict=True):
         x, y = log["rate"].transpose("axis", "time").values[:2]
         sums = make_log(
