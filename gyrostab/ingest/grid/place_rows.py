@@ -33,7 +33,8 @@ from gyrostab.ingest.grid.scan_pass import ScanPass, file_of, stamp_blocks
 from gyrostab.ingest.grid.starting_period import Stamps
 from gyrostab.schema import signal_name
 from gyrostab.store.lazy import find_source, read_slice
-from gyrostab.time.grid import period_ns, stamp_ns
+from gyrostab.time.grid import period_ns
+from gyrostab.time.stamps import stamp_ns
 
 _MAX_RATE_DIFFERENCE = 0.02  # relative, between declared and estimated rate
 _EVEN_ROWS = 2**18  # rows at the beginning that give the rate of a log with even stamps

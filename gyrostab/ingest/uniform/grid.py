@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
 from gyrostab.ingest.limits import is_absurd_grid
-from gyrostab.time.grid import NANOSECONDS, grid_index
+from gyrostab.time.grid import grid_index
+from gyrostab.time.stamps import NANOSECONDS
 
 #: Stamps in memory at one time.
 BLOCK_STAMPS = 2**20
