@@ -17,7 +17,7 @@ from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.physics.logger import LoggerFilter
+from gyrostab.physics.logger_filter import LoggerFilter
 
 Array = NDArray[np.float64]
 

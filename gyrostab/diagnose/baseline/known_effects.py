@@ -22,7 +22,7 @@ from gyrostab.diagnose.predict.linear_model import (
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.physics.base import Effect
-from gyrostab.physics.logger import LoggerFilter
+from gyrostab.physics.logger_filter import LoggerFilter
 from gyrostab.physics.prediction import Prediction
 from gyrostab.simulate.model import Model
 

@@ -26,9 +26,9 @@ from gyrostab.diagnose.statistics.spectral_line import line_quality
 from gyrostab.errors import GyrostabError
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.base import Effect
+from gyrostab.physics.earth_rate import EarthRate
 from gyrostab.physics.prediction import Windows
 from gyrostab.physics.registry import effects
-from gyrostab.physics.rotation import EarthRate
 
 _ANGLE = "deg"
 _TAIL = float(ndtr(-NORMAL_95))  # beyond either end of an interval
