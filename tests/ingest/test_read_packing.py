@@ -264,7 +264,7 @@ def write_regular(
     [
         "plain",
         "scale and offset",
-        "several missing",
+        "fill",
         "valid range, packed",
         "valid max",
         "unsigned, packed",
@@ -282,16 +282,8 @@ def test_regular_log_of_another_program_is_decoded_like_a_raw_log(tmp_path, case
     ("attribute", "value"), [("calendar", "noleap"), ("units", "seconds since now")]
 )
 def test_regular_log_with_a_climate_calendar_is_refused(tmp_path, attribute, value):
-    with pytest.raises(UnitError, match=f"log.nc: variable 'time': .*{value}"):
+    with pytest.raises(UnitError, match=f"log.nc: column 'time': .*{value}"):
         read_log(write_regular(tmp_path / "log.nc", COUNTS, {}, **{attribute: value}))
-
-
-def test_an_unwritten_sample_of_a_regular_log_is_missing(tmp_path):
-    path = write_regular(tmp_path / "log.nc", COUNTS.astype("f4"), {})
-    with netCDF4.Dataset(path, "a") as file:
-        file.variables["rate"].set_auto_mask(False)
-        file.variables["rate"][0, 3] = netCDF4.default_fillvals["f4"]
-    assert np.flatnonzero(np.isnan(read_log(path).rate.values[0])).tolist() == [3]
 
 
 @pytest.mark.parametrize("regular", [True, False])
