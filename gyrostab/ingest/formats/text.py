@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import gzip
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from io import BufferedReader
@@ -89,13 +88,8 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     return summary_of(plan, "text", rows, head=head, tail=tail, notes=layout.notes)
 
 
-def read(
-    path: Path,
-    options: ReadOptions,
-    *,
-    stop: Callable[[], bool] | None = None,
-) -> xr.Dataset:
-    """Return the raw log of a text file; raise `CancelledError` once `stop` returns true."""
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
+    """Return the raw log of a text file; see `gyrostab.ingest.read_log`."""
     layout, plan = _plan_file(path, options)
     builder, parser, line = RawLogBuilder(plan), BlockParser(layout, plan), layout.line
 
@@ -105,8 +99,6 @@ def read(
 
     blocks = _read_blocks(path, layout.offset, growing=options.growing)
     for parsed, converted in map_in_order(parse, blocks):
-        if stop is not None and stop():
-            raise CancelledError
         builder.add(converted, partial(parsed.name_lines, line), parsed.quote_line)
         line += parsed.lines
     raw = builder.finish(layout.notes)
