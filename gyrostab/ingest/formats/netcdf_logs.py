@@ -56,8 +56,11 @@ def open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
         if not _is_regular(path):
             return None
     check = partial(check_declared, given=options.limits)
+    stored = open_stored(path, strict=options.strict, check=check)
+    if path.is_dir() and content != "log":
+        stored = stored[sorted(stored.variables, key=str)]  # as the order in a folder is arbitrary
     try:
-        return _open(path, open_stored(path, strict=options.strict, check=check))
+        return _open(path, stored)
     except TimeError:
         if content == "log":
             raise
