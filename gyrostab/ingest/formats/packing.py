@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.plan import Plan
-from gyrostab.ingest.columns.plan_draft import Column
+from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.stamps import TimeUnit
 
 #: Stored numbers -> counts or values.
@@ -213,7 +212,7 @@ def fold_packing(plan: Plan, stored: Sequence[Any]) -> tuple[Plan, dict[int, Dec
             packing = Packing.from_attributes(where, variable.dtype, variable.attributes)
             column, decoders[column.source] = _fold_column(column, packing)
         columns.append(column)
-    return replace(plan, columns=tuple(columns)), decoders
+    return replace(plan, columns=columns), decoders
 
 
 def _fold_column(column: Column, packing: Packing) -> tuple[Column, Decoder]:

@@ -29,8 +29,8 @@ from gyrostab.ingest.columns.dates import (
     is_time_of_day,
 )
 from gyrostab.ingest.columns.headers import FileColumn
-from gyrostab.ingest.columns.plan import Plan, plan_columns
-from gyrostab.ingest.columns.plan_draft import Column
+from gyrostab.ingest.columns.plan import Column, Plan
+from gyrostab.ingest.columns.plan_columns import plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, from_fortran
 from gyrostab.ingest.options import FileSummary, ReadOptions
