@@ -287,17 +287,22 @@ def test_regular_log_with_a_climate_calendar_is_refused(tmp_path, attribute, val
 
 
 @pytest.mark.parametrize("regular", [True, False])
-@pytest.mark.parametrize("named", [True, False])
-def test_default_fill_value_of_zarr_is_ignored(tmp_path, named, regular):
+def test_default_fill_value_of_zarr_is_ignored(tmp_path, regular):
     """Zarr writes a fill value of 0 by default, but samples of 0 are values."""
     path = tmp_path / "log.zarr"
     if regular:
-        if not named:
-            pytest.skip("a regular log names its dimensions")
         write_regular(path, COUNTS, {"_FillValue": np.int16(0)}, zarr_format=2)
     else:
         group = zarr.open_group(path, mode="w", zarr_format=2)
         for name, values, unit in (("time", np.arange(ROWS), "s"), ("gyro_x", COUNTS, "deg/h")):
-            attributes = {"units": unit} | ({"_ARRAY_DIMENSIONS": ["obs"]} if named else {})
+            attributes = {"units": unit, "_ARRAY_DIMENSIONS": ["obs"]}
             group.create_array(name, data=values).attrs.update(attributes)
     np.testing.assert_array_equal(read_log(path).rate.values[0], COUNTS)
+
+
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_a_zarr_array_that_does_not_name_its_dimensions_is_refused(tmp_path, zarr_format):
+    group = zarr.open_group(tmp_path / "log.zarr", mode="w", zarr_format=zarr_format)
+    group.create_array("gyro_x", data=COUNTS)
+    with pytest.raises(FormatError, match=r"log.zarr: an array does not name its dimensions"):
+        read_log(tmp_path / "log.zarr")

@@ -13,6 +13,7 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, SchemaError, TimeError
 from gyrostab.ingest.concat.grid import log_span
+from gyrostab.ingest.formats.netcdf_variables import open_undecoded
 from gyrostab.ingest.limits import check_declared
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
@@ -25,12 +26,6 @@ from gyrostab.store.read import open_stored
 from gyrostab.store.remote import find_url
 from gyrostab.store.times import decode_stamps
 
-#: Options to look into a file with xarray.
-_UNDECODED: dict[str, Any] = {
-    "chunks": None,
-    "decode_cf": False,
-    "create_default_indexes": False,
-}
 _CALENDARS = ("standard", "gregorian", "proleptic_gregorian")
 _VALID_RANGES = {"valid_range", "valid_min", "valid_max"}
 _OTHER_CONTENT = {"surface": "a dynamic Allan variance", "product": "a product"}
@@ -92,14 +87,7 @@ def _open_remote(path: Path, url: str) -> xr.Dataset:
 
 def _is_regular(path: Path) -> bool:
     """Return whether a file has signal, axes, stamps and sampling rate, as a regular log has."""
-    extra: dict[str, Any] = {"engine": "netcdf4"}
-    if path.is_dir():
-        import zarr
-
-        if "sampling_rate_hz" not in zarr.open_group(path, mode="r").attrs:
-            return False  # xarray cannot open every store
-        extra = {"engine": "zarr", "consolidated": False}
-    with xr.open_dataset(path, **extra, **_UNDECODED) as stored:
+    with open_undecoded(path) as stored:
         stamps = stored.variables.get("time")
         return (
             "sampling_rate_hz" in stored.attrs
