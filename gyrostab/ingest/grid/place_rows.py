@@ -55,7 +55,6 @@ class RowPlacer:
     declared: float | None  # sampling rate [Hz]; found from the stamps if None
     tolerance: float  # as for `place_by_stamp`
     max_gap: float  # a longer step ahead is a step of the clock [s]
-    block: int  # rows in memory at one time
 
     def place(self) -> tuple[Placement, float, list[str]]:
         """Return the placement, the sampling rate [Hz] and notes."""
@@ -102,7 +101,7 @@ class RowPlacer:
             return self._place_without_time()
         # single unreadable rows still occupy samples
         count_all_rows = scanned.absent <= 0.01 * scanned.rows
-        stamps: Stamps = partial(stamp_blocks, raw, scanned, block=self.block)
+        stamps: Stamps = partial(stamp_blocks, raw, scanned)
         try:
             estimate = estimate_rate(stamps, where=self.where)
         except TimeError:
@@ -118,7 +117,7 @@ class RowPlacer:
             rate, estimate = declared, replace(estimate, finer=None, even=None)
         deviating: list[tuple[int, int, float]] = []
         if estimate.counted:
-            counted = partial(stamp_blocks, raw, scanned, block=self.block, all_rows=count_all_rows)
+            counted = partial(stamp_blocks, raw, scanned, all_rows=count_all_rows)
             placement = place_by_count(counted, estimate, rate, max_gap=self.max_gap)
         else:
             placement = self._place_stamped(stamps, estimate.jitter, rate, count_all_rows)

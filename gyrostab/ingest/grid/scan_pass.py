@@ -81,10 +81,10 @@ def find_spans(bad: Any, offset: int) -> NDArray[np.int64]:
     return np.asarray(edges.reshape(-1, 2) + offset, dtype=np.int64)
 
 
-def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPass:
+def scan_rows(raw: xr.Dataset, name: str) -> ScanPass:
     """Scan every cell of a raw log once; `FormatError` when no row holds a number."""
     rows = raw.sizes["row"]
-    block -= block % 8
+    block = BLOCK_ROWS // 8 * 8
     channels = [str(key) for key, variable in raw.data_vars.items() if variable.dims == ("row",)]
     spans = ((begin, min(rows, begin + block)) for begin in range(0, max(rows, 1), block))
     blocks = map_in_order(partial(_scan_block, raw, name, channels), spans)
@@ -109,19 +109,19 @@ def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPas
 
 
 def stamp_blocks(
-    raw: xr.Dataset, scanned: ScanPass, *, block: int = BLOCK_ROWS, all_rows: bool = False
+    raw: xr.Dataset, scanned: ScanPass, *, all_rows: bool = False
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Yield row numbers and stamps [ns] (or `NO_STAMP`) of rows with a sample, in blocks."""
 
     def read_block(begin: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        end = min(scanned.rows, begin + block)
+        end = min(scanned.rows, begin + BLOCK_ROWS)
         values = read_stamps(raw, begin, end)
         if not scanned.repeated and (all_rows or scanned.absent == 0):
             return np.arange(begin, end), values
         keep = scanned.mask(begin, end)
         return np.flatnonzero(keep) + begin, values[keep]
 
-    return map_in_order(read_block, range(0, scanned.rows, block), workers=1)
+    return map_in_order(read_block, range(0, scanned.rows, BLOCK_ROWS), workers=1)
 
 
 def _source_names(raw: xr.Dataset) -> list[str]:
