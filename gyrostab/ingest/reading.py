@@ -12,7 +12,8 @@ import xarray as xr
 from gyrostab.errors import FormatError, GyrostabError, OptionError
 from gyrostab.ingest.columns.pieces import SPILL_BYTES, Spool
 from gyrostab.ingest.combine import attach_channels, concatenate, memory_bytes, move_to_disk
-from gyrostab.ingest.concat import concatenate_logs, log_span
+from gyrostab.ingest.concat.core import concatenate_logs
+from gyrostab.ingest.concat.grid import log_span
 from gyrostab.ingest.damaged_files import (
     add_lost_notes,
     check_share,

@@ -35,6 +35,9 @@ NO_STAMPS = (
     "or give --rate HZ for a log without time"
 )
 
+#: Largest distance of the smoothed stamps from the grid before a sample is skipped [samples].
+HOLD = 0.75
+
 #: Rows that the placement kernel processes at one time.
 _STRETCH_ROWS = 1 << 18
 
@@ -134,13 +137,10 @@ def append_runs(
         runs.append(table)
 
 
-def place_by_stamp(
-    stamps: Stamps, rate: float, *, tolerance: float, max_gap: float, where: str
-) -> Placement:
+def place_by_stamp(stamps: Stamps, rate: float, *, max_gap: float, where: str) -> Placement:
     """Place rows by their stamps; the result does not depend on the size of their blocks.
 
-    `tolerance` is the largest distance of the smoothed stamps from the grid, beyond half a sample,
-    before a sample is skipped [samples]; a step ahead above `max_gap` [s] is a step of the clock.
+    A step ahead above `max_gap` [s] is a step of the clock.
     """
     period = sum(period_ns(rate))
     state, ring = kernel.new_state()
@@ -151,9 +151,7 @@ def place_by_stamp(
         if len(first) == 0:
             first = readable_stamps(values)[:_FIRST_STAMPS]
         n = _STRETCH_ROWS if len(rows) == _STRETCH_ROWS + LOOK_AHEAD else len(rows)
-        new, happened = kernel.place(
-            rows, values, n, period, 0.5 + tolerance, max_gap * rate, state, ring
-        )
+        new, happened = kernel.place(rows, values, n, period, HOLD, max_gap * rate, state, ring)
         runs.append(new)
         events.append(happened)
     if not state[kernel.STARTED]:

@@ -53,7 +53,6 @@ class RowPlacer:
     raw: xr.Dataset
     scanned: ScanPass
     declared: float | None  # sampling rate [Hz]; found from the stamps if None
-    tolerance: float  # as for `place_by_stamp`
     max_gap: float  # a longer step ahead is a step of the clock [s]
 
     def place(self) -> tuple[Placement, float, list[str]]:
@@ -172,11 +171,7 @@ class RowPlacer:
     ) -> Placement:
         """Place rows by their stamps, or in order if stamps have jitter."""
         scanned = self.scanned
-        options: dict[str, Any] = {
-            "tolerance": self.tolerance,
-            "max_gap": self.max_gap,
-            "where": self.where,
-        }
+        options: dict[str, Any] = {"max_gap": self.max_gap, "where": self.where}
 
         def place_along(jitter: JitterModel) -> Placement:
             def place() -> Placement:  # repetitions occupy no samples

@@ -11,8 +11,8 @@ from typing import Any
 
 import xarray as xr
 
-from gyrostab.errors import OptionError
-from gyrostab.ingest.concat import concatenate_logs, split_axes
+from gyrostab.ingest.concat.axes import split_axes
+from gyrostab.ingest.concat.core import concatenate_logs
 from gyrostab.ingest.gap_table import gap_variables, name_lost, sort_gaps
 from gyrostab.ingest.grid.fill import count_placed, gather_channel, rows_on_grid
 from gyrostab.ingest.grid.gaps import find_gaps
@@ -122,7 +122,6 @@ def regularise(
     raw: xr.Dataset,
     *,
     rate: float | None = None,
-    tolerance: float = 0.25,
     max_gap: str | float = "10D",
     limits: Mapping[str, float] | None = None,
 ) -> xr.Dataset:
@@ -136,9 +135,6 @@ def regularise(
         its uniform time by `gyrostab.ingest.uniform.as_uniform`.
     rate : float, optional
         Sampling rate [Hz]; estimated from the stamps by default, and checked against them if given.
-    tolerance : float
-        Largest distance of the smoothed stamps from the grid, beyond half a sample, before a sample
-        is skipped [samples].
     max_gap : str or float
         A longer step of the stamps ahead is taken as a step of the clock, not as a gap; a number
         is in seconds.
@@ -181,8 +177,6 @@ def regularise(
     """
     if rate is not None:
         check_rate(rate, "rate")
-    if not 0 <= tolerance < 0.5:
-        raise OptionError(f"tolerance={tolerance!r} must be at least 0 and below 0.5 samples")
     is_log = isinstance(raw, xr.Dataset) and "row" not in raw.dims
     if is_log and "sampling_rate_hz" in raw.attrs:
         log = as_uniform(raw)
@@ -193,7 +187,7 @@ def regularise(
     if "axis_rows" in raw.attrs:
         options: dict[str, Any] = {"max_gap": max_gap, "limits": limits}
         parts = [part.assign_attrs(notes=[]) for part in split_axes(raw)]
-        logs = [regularise(part, rate=rate, tolerance=tolerance, **options) for part in parts]
+        logs = [regularise(part, rate=rate, **options) for part in parts]
         labels, note = _describe_axes(raw.attrs["axis_rows"], parts, logs)
         log = concatenate_logs(logs, labels, **options)
         return log.assign_attrs(notes=[*texts(raw, "notes"), *texts(log, "notes"), note])
@@ -203,7 +197,7 @@ def regularise(
     scanned = scan_rows(raw, name)
     given = rate if rate is not None else raw.attrs.get("declared_rate_hz")
     declared = None if given is None else float(given)
-    placer = RowPlacer(raw, scanned, declared, tolerance, gap_limit)
+    placer = RowPlacer(raw, scanned, declared, gap_limit)
     placement, hertz, notes = placer.place()
     check_grid(raw, placement, hertz, gap_limit, allowed)
     check_span(placement.start, hertz, placement.size, file_of(raw)[0])

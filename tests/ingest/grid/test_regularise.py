@@ -331,7 +331,6 @@ def test_unusable_logs_are_errors():
         regularise(raw_log(np.full(100, np.iinfo(np.int64).min)))
     for wrong in (
         {"rate": -1.0},
-        {"tolerance": 0.7},
         {"max_gap": "soon"},
         {"max_gap": 0},
     ):
@@ -351,8 +350,6 @@ def test_a_regular_log_passes_through():
     assert regularise(log, rate=100.0) is log
     with pytest.raises(OptionError, match=r"tool.csv is a regular log of 100 Hz, not of 200 Hz"):
         regularise(log, rate=200.0)
-    with pytest.raises(OptionError, match="tolerance=7"):
-        regularise(log, tolerance=7)
 
 
 def test_arrays_keep_every_bit():
@@ -367,7 +364,6 @@ def test_rows_of_a_single_run_are_returned_unchanged():
     placement = place_by_stamp(
         lambda: iter([(np.arange(50), stamps_of(np.arange(50), 10.0))]),
         10.0,
-        tolerance=0.25,
         max_gap=1e9,
         where="x",
     )
