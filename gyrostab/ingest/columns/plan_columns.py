@@ -29,7 +29,7 @@ def plan_columns(
     *,
     rising: Callable[[int], bool] | None = None,
     above: Sequence[str] = (),
-    is_filled: Callable[[int], bool] | None = None,
+    is_filled: Callable[[int], bool] = lambda source: True,
     word_in: Callable[[int], str] = lambda source: "",
 ) -> Plan:
     """Determine the role and unit of each column.
@@ -42,7 +42,7 @@ def plan_columns(
     check_columns(path, len(columns), options.limits)
     headers = [column.header for column in columns]
     split = [(header, split_header(header)[0]) for header in headers]
-    preset = PresetMatch("")
+    preset = PresetMatch()
     if not any(AXIS_PATTERN.match(name.lower()) for _, name in split):  # named gyro_x ... already
         preset = find_preset(path, split, above=above, is_filled=is_filled)
     plan = Plan(path, options, rising, word_in)
