@@ -116,8 +116,12 @@ def _check_classic_header(path: Path) -> None:
             return
     from scipy.io import netcdf_file
 
+    class Header(netcdf_file):  # type: ignore[misc]
+        def _read_gatt_array(self) -> None:
+            self._read_att_array()  # they would replace members of the same names
+
     try:
-        netcdf_file(_BoundedFile(path.open("rb", buffering=0)), mmap=True).close()
+        Header(_BoundedFile(path.open("rb", buffering=0)), mmap=True).close()
     except Exception as error:  # scipy raises errors of many kinds on damaged headers
         raise FormatError(
             f"{path.name}: the header of this NetCDF file is damaged or cut off ({error}); copy "
