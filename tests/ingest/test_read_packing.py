@@ -278,6 +278,13 @@ def test_regular_log_of_another_program_is_decoded_like_a_raw_log(tmp_path, case
     assert log.time.values[5] == np.datetime64("2026-01-01T00:00:00.05")
 
 
+def test_samples_of_a_regular_log_that_were_not_written_are_missing(tmp_path):
+    values = np.append(np.linspace(1.0, 2.0, ROWS - 1), netCDF4.default_fillvals["f8"])
+    rate = read_log(write_regular(tmp_path / "log.nc", values, {})).rate.values[0]
+    assert np.flatnonzero(np.isnan(rate)).tolist() == [ROWS - 1]
+    np.testing.assert_allclose(rate[: ROWS - 1], values[:-1])
+
+
 @pytest.mark.parametrize(
     ("attribute", "value"), [("calendar", "noleap"), ("units", "seconds since now")]
 )

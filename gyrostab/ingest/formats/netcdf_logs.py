@@ -86,13 +86,18 @@ def _open_remote(path: Path, url: str) -> xr.Dataset:
 
 
 def _is_regular(path: Path) -> bool:
-    """Return whether a file has signal, axes, stamps and sampling rate, as a regular log has."""
+    """Return whether a file has signal, axes, stamps and sampling rate, as a regular log has.
+
+    The signal of a NetCDF file needs a fill value: without one, samples that were not written have
+    that of the library, which xarray does not take for missing.
+    """
     with open_undecoded(path) as stored:
         stamps = stored.variables.get("time")
+        signals = [stored.variables[name] for name in SIGNAL_UNITS if name in stored.variables]
         return (
             "sampling_rate_hz" in stored.attrs
             and "axis" in stored.variables
-            and any(name in stored.variables for name in SIGNAL_UNITS)
+            and any(path.is_dir() or "_FillValue" in signal.attrs for signal in signals)
             and stamps is not None
             and _is_dated(stamps)
             and all(_decodes_as_cf(variable.attrs) for variable in stored.variables.values())
@@ -116,9 +121,9 @@ def _check_classic_header(path: Path) -> None:
             return
     from scipy.io import netcdf_file
 
-    class Header(netcdf_file):  # type: ignore[misc]
+    class Header(netcdf_file):
         def _read_gatt_array(self) -> None:
-            self._read_att_array()  # they would replace members of the same names
+            self._read_att_array()  # type: ignore[attr-defined]  # they would replace members of the same names
 
     try:
         Header(_BoundedFile(path.open("rb", buffering=0)), mmap=True).close()
@@ -140,7 +145,7 @@ def _is_dated(stamps: xr.Variable) -> bool:
     if stamps.attrs.get("calendar", "standard") not in _CALENDARS:
         return False
     try:
-        return decode_stamps(stamps[:1]).dtype.kind == "M"
+        return bool(decode_stamps(stamps[:1]).dtype.kind == "M")
     except Exception:  # whatever it raises on other units and calendars
         return False
 
