@@ -108,6 +108,7 @@ class _Placer:
                 GAIN,
                 HOLD,
                 self.max_gap_ns / self.period,
+                self.jitter.loss_nats,
                 self.level,
                 self.phase,
                 self.observed,
