@@ -26,6 +26,7 @@ _OFF_GRID_SHARE = 0.01  # of the values, and of a step, that values may be off t
 _MAX_ITERATIONS = 50
 #: Levels in as much beyond an empty zone as it is wide; by chance 1 in 2^40 gaps leaves out 40.
 _MIN_BEYOND = 40
+_MIN_STICKING_RUNS = 5  # of equal samples at one value; design choice
 
 
 def bin_widths(values: Array, step: float) -> tuple[Array, Array]:
@@ -109,6 +110,39 @@ def empty_zone(values: Array) -> tuple[float, float]:
     if beyond[gap] < _MIN_BEYOND:
         return np.nan, np.nan
     return float(outer[gap]), float((outer[gap] - inner[gap]) / beyond[gap])
+
+
+def sticking_value(values: Array) -> tuple[float, float]:
+    """Find the value other than 0 at which an axis sticks, and its samples per repeated sample.
+
+    Held samples repeat a different value each time; a loop sticks at one value, and most runs of
+    equal samples have it. Without a quantization grid no other value recurs. Ends of the range are
+    left out. NaN without such a value.
+
+    Examples
+    --------
+    >>> rate = np.random.default_rng(1).normal(0.0, 1.0, 20_000)
+    >>> sticking_value(np.where(np.abs(rate - 0.5) < 0.3, 0.5, rate))[0], sticking_value(rate)
+    (0.5, (nan, 1.0))
+    """
+    same = np.concatenate([[False], values[1:] == values[:-1]])
+    starts = np.flatnonzero(same[1:] & ~same[:-1])
+    levels, runs = np.unique(values[starts], return_counts=True)
+    inside = (levels != 0.0) & (levels > np.nanmin(values)) & (levels < np.nanmax(values))
+    if not inside.any():
+        return np.nan, 1.0
+    most = int(np.argmax(np.where(inside, runs, 0)))
+    if runs[most] < max(_MIN_STICKING_RUNS, 0.5 * runs.sum()):
+        return np.nan, 1.0
+    at_level = values == levels[most]
+    return float(levels[most]), float(at_level.sum() / (at_level & same).sum())
+
+
+def sticking_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
+    """Find the axes (axis,) that stick at a value other than 0; see `sticking_value`."""
+    if "zone_centre" not in blocks:
+        return np.zeros(blocks.sizes["axis"], np.bool_)
+    return np.isfinite(blocks["zone_centre"].values)
 
 
 def _parabola_columns(at: Array, reach: float) -> Array:

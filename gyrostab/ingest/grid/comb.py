@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 #: Bins of a stretch, bins in the shortest period, and stretches that are used at most.
 _BINS, _BINS_PER_PERIOD, _MAX_STRETCHES = 1 << 15, 4, 64
 _MAX_PEAKS = 3
-#: Shortest period [ticks of the clock], whose multiples say nothing of the sampling; and the
+#: Shortest period [ticks of the clock]: of a tick all stamps are multiples, however sampled. The
 #: longest tick [ns] that is certainly one, as in stamps in milliseconds.
 MIN_TICKS, _COMMON_TICK = 1.5, 1e6
 _PEAK_WIDTH = 0.02  # relative distance of two peaks, at least
