@@ -59,6 +59,11 @@ class RateQuantization(Effect):
             count
         ), state
 
+    def transfer(self, rate: Array) -> Array | None:
+        """Return the truncated values of "zero"; rounding adds noise instead."""
+        is_truncated = self.mode == "zero" and self.step > 0.0
+        return self.step * np.trunc(rate / self.step) if is_truncated else None
+
     def explain(self, windows: Windows) -> Prediction:
         """Predict white noise of step^2 / 12 in every sample, and the offset of "floor".
 

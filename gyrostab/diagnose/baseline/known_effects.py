@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, band_columns
 from gyrostab.diagnose.baseline.known_lines import average_in_bands, expect_lines, resonance_density
 from gyrostab.diagnose.baseline.predicted_effects import complex_factors, predict_effect
+from gyrostab.diagnose.baseline.sample_transfer import undo_transfer
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import (
     cross_without,
@@ -25,6 +26,7 @@ from gyrostab.physics.base import Effect
 from gyrostab.physics.logger_filter import LoggerFilter
 from gyrostab.physics.prediction import Prediction
 from gyrostab.simulate.model import Model
+from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
 _EVERYWHERE = "lattice"  # the anomaly of every sample
@@ -72,7 +74,8 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
         for extra in powers
         if extra.acting.prediction.line is not None and extra.factor.any()
     ]
-    spectrum = spread_by_gaps(noise + added * white_response, blocks)
+    left = _share_left(acting, model, blocks)[..., None]
+    spectrum = spread_by_gaps((noise + added * white_response) * left, blocks)
     variables = _shared_cross(powers, white_response, blocks)
     if narrow and "line_power" in blocks:
         variables |= expect_lines(blocks, narrow, white_response[:, 0])
@@ -194,6 +197,20 @@ def _filter_response(acting: Sequence[_ActingEffect], blocks: xr.Dataset) -> Arr
         if active.prediction.response:
             response[active.rows] *= band_response(active.effect, blocks)
     return response
+
+
+def _share_left(acting: Sequence[_ActingEffect], model: Model, blocks: xr.Dataset) -> Array:
+    """Return the share of the noise that effects on single samples leave, (axis, block)."""
+    share = np.ones((blocks.sizes["axis"], blocks.sizes["block"]))
+    rate = float(blocks.attrs["sampling_rate_hz"]) * float(model.log.get("oversampling", 1))
+    for active in acting:
+        if active.effect.transfer(np.zeros(1)) is None:
+            continue
+        for row, axis in zip(active.rows, active.axes, strict=True):
+            variance = model.coefficients(axis)["N"] ** 2 * HOUR * rate
+            mean = blocks["mean"].values[row]
+            share[row] *= undo_transfer(active.effect.transfer, mean, variance, known=True).share
+    return share
 
 
 def _shared_cross(
