@@ -50,7 +50,7 @@ def constant_rates(
         rate[axes.index(turning)] -= HOUR * blocks["channel_rotation_rate"].values
     for row, effect in _changed_rows(axes, effects):
         recorded = blocks["mean"].values[row]
-        rate[row] += _undo(effect, blocks, row).mean - recorded
+        rate[row] += _noise_before(effect, blocks, row).mean - recorded
     return dict(zip(axes, _average_blocks(blocks, rate).tolist(), strict=True))
 
 
@@ -65,7 +65,7 @@ def undo_noise_loss(
     out = {axis: dict(terms) for axis, terms in noise.items()}
     axes, rate = tuple(out), float(blocks.attrs["sampling_rate_hz"])
     for row, effect in _changed_rows(axes, effects):
-        passed = _undo(effect, blocks, row)
+        passed = _noise_before(effect, blocks, row)
         added = getattr(effect, "step", 0.0) ** 2 / 12.0
         lost = passed.variance - (_variance_of_axis(blocks, row) - added)
         terms = out[axes[row]]
@@ -98,7 +98,7 @@ def _changed_rows(axes: tuple[str, ...], effects: Sequence[Effect]) -> list[tupl
     ]
 
 
-def _undo(effect: Effect, blocks: xr.Dataset, row: int) -> PassedNoise:
+def _noise_before(effect: Effect, blocks: xr.Dataset, row: int) -> PassedNoise:
     """Return the noise of an axis before an effect."""
     mean = blocks["mean"].values[row]
     return undo_transfer(effect.transfer, mean, _variance_of_axis(blocks, row))

@@ -48,10 +48,7 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     resent = np.where(steps[:, None, None] > 0.0, 0, by_name["resent"])
     widths = np.array([bin_widths(_kept_values(work, row), step) for row, step in enumerate(steps)])
     centres, per_repeat = np.transpose(
-        [
-            sticking_value(_kept_values(work, row)) if step == 0.0 else (np.nan, 1.0)
-            for row, step in enumerate(steps)
-        ]
+        [sticking_value(_kept_values(work, row), step) for row, step in enumerate(steps)]
     )
     zones = np.array(
         [

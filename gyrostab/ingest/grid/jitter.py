@@ -248,7 +248,7 @@ def _refine_model(
         period = float(ct / cc)
         sigma = 1.4826 * float(np.median(np.abs(np.concatenate(offs))))
         lost = np.concatenate(losses)
-        nats += len(lost) * _entropy(lost) - _loss_cost(lost, loss_nats)
+        nats += len(lost) * _loss_entropy(lost) - _loss_cost(lost, loss_nats)
         loss_nats = _fit_loss_nats(lost)
         if not abs(period / jitter.period - 1) < most_off or sigma > 2 * _MAX_SIGMA:
             return None
@@ -261,7 +261,7 @@ def _refine_model(
     return JitterModel(period, sigma, jitter.observe, jitter.group, nats / rows, loss_nats, fits)
 
 
-def _entropy(lost: Integers) -> float:
+def _loss_entropy(lost: Integers) -> float:
     """Return the mean code length of the samples lost before each row [nats]."""
     shares = np.unique(lost, return_counts=True)[1] / max(1, len(lost))
     return -float(shares @ np.log(shares))
