@@ -40,7 +40,10 @@ def constant_rates(
     """
     axes = tuple(str(axis) for axis in blocks["axis"].values)
     rate = blocks["mean"].values.copy()
+    changed = _changed_rows(axes, effects)
     for effect in effects:
+        if any(effect is other for _, other in changed):
+            continue
         effect_axes = tuple(axis for axis in axes if not effect.axes or axis in effect.axes)
         rows = [axes.index(axis) for axis in effect_axes]
         for name, design in predict_effect(effect, blocks, effect_axes).mean.items():
@@ -48,7 +51,7 @@ def constant_rates(
             rate[rows] -= sizes[:, None] * np.atleast_2d(design)
     if turning in axes and "channel_rotation_rate" in blocks:
         rate[axes.index(turning)] -= HOUR * blocks["channel_rotation_rate"].values
-    for row, effect in _changed_rows(axes, effects):
+    for row, effect in changed:
         recorded = blocks["mean"].values[row]
         rate[row] += _noise_before(effect, blocks, row).mean - recorded
     return dict(zip(axes, _average_blocks(blocks, rate).tolist(), strict=True))

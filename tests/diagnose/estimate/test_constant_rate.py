@@ -63,6 +63,7 @@ def test_rounded_values_have_the_constant_rate_and_noise_of_those_before(mode, n
         {"name": "clipping", "limit": 0.5, "centre": 0.4},
         {"name": "clipping", "limit": 0.8},
         {"name": "dead_zone", "width": 0.4, "centre": 0.4},
+        {"name": "dead_zone", "width": 0.4, "centre": 0.7},
         {"name": "dead_zone", "width": 0.6, "edge": "jump"},
     ],
     ids=lambda table: "-".join(map(str, table.values())),
