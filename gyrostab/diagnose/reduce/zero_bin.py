@@ -145,7 +145,7 @@ def sticking_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
     """Find the axes (axis,) that stick at a value other than 0; see `sticking_value`."""
     if "zone_centre" not in blocks:
         return np.zeros(blocks.sizes["axis"], np.bool_)
-    return np.isfinite(blocks["zone_centre"].values)
+    return np.asarray(np.isfinite(blocks["zone_centre"].values))
 
 
 def _parabola_columns(at: Array, reach: float) -> Array:
