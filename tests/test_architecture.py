@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 BLIND_TEST = sorted((ROOT / "gyrostab" / "blindtest").rglob("*.py"))
 PUBLIC_MODULES = ("gyrostab.errors", "gyrostab.units", "gyrostab.schema", "gyrostab.progress")
-HEAVY = ("matplotlib", "numba", "pyarrow", "netCDF4", "h5py", "pymatreader", "scipy.stats")
+HEAVY = ("matplotlib", "numba", "pyarrow", "netCDF4", "h5py", "scipy.stats")
 
 
 def _python(code: str) -> subprocess.CompletedProcess[str]:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
 from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Spool
-from gyrostab.ingest.concat import absence_notes, group_axes, merge_notes, split_axes
+from gyrostab.ingest.concat.axes import group_axes, split_axes
 from gyrostab.ingest.concat.channels import check_units
+from gyrostab.ingest.concat.core import absence_notes, merge_notes
 from gyrostab.ingest.overlap import drop_repeats, first_known_stamp, stamp_span
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import concatenate_columns, make_dask, select_part, stack_rows
@@ -133,20 +134,24 @@ def _concatenate_parts(
     absent: dict[str, list[str]] = {}
     data: dict[str, Any] = {}
     coords: dict[str, Any] = {}
-    if "time" in parts[0].variables:
-        coords["time"] = (
-            "row",
-            concatenate_columns([part["time"].data for part in parts], CHUNK_ROWS),
+
+    def join(label: str, columns: Sequence[Any | None]) -> Any:
+        """Join the columns of all parts; NaN, which takes no memory, where a part lacks it."""
+        absent[label] = _files_without(
+            groups, {id(part) for part, c in zip(parts, columns, strict=True) if c is not None}
         )
+        blanks = (np.broadcast_to(np.nan, (size,)) for size in sizes)
+        filled = [blank if c is None else c for c, blank in zip(columns, blanks, strict=True)]
+        return concatenate_columns(filled, CHUNK_ROWS)
+
+    if "time" in parts[0].variables:
+        stamps = concatenate_columns([part["time"].data for part in parts], CHUNK_ROWS)
+        coords["time"] = ("row", stamps)
     if signal is not None:
         axes = sorted({str(axis) for part in parts for axis in part["axis"].values})
-        stack = _stack_signal(parts, signal, axes)
-        for axis in axes:
-            absent[f"axis {axis}"] = _files_without(
-                groups, {id(part) for part in parts if axis in _axis_names(part)}
-            )
+        rows = [join(f"axis {a}", [_axis_column(part, signal, a) for part in parts]) for a in axes]
         packing = common_packing(part[signal].encoding for part in parts)
-        data[signal] = (("axis", "row"), stack, {"units": SIGNAL_UNITS[signal]}, packing)
+        data[signal] = (("axis", "row"), stack_rows(rows), {"units": SIGNAL_UNITS[signal]}, packing)
         coords["axis"] = np.array(axes, dtype=str)
     for channel in dict.fromkeys(
         str(name) for part in parts for name in part.data_vars if name != signal
@@ -154,19 +159,18 @@ def _concatenate_parts(
         holders = [(part.attrs["source_files"][0], part) for part in parts if channel in part]
         advice = f"give one with --unit {channel}=UNIT or drop it with --map {channel}=-"
         check_units(holders, channel, advice)
+        columns = [part[channel].data if channel in part else None for part in parts]
         units = holders[0][1][channel].attrs["units"]
-        columns = [part[channel].data if channel in part else _blank_column(part) for part in parts]
-        packing = common_packing(part[channel].encoding for part in parts if channel in part)
-        data[channel] = ("row", concatenate_columns(columns, CHUNK_ROWS), {"units": units}, packing)
-        absent[f"channel {channel}"] = _files_without(
-            groups, {id(part) for part in parts if channel in part}
-        )
+        packing = common_packing(part[channel].encoding for _, part in holders)
+        data[channel] = ("row", join(f"channel {channel}", columns), {"units": units}, packing)
     joined = xr.Dataset(data, coords=coords, attrs=dict(parts[0].attrs))
     joined.attrs.update(
         source_files=names,
         row_start=[int(start) for start in np.cumsum([0, *sizes[:-1]])],
         notes=[
-            *merge_notes((part.attrs["source_files"][0], part.attrs["notes"]) for part in parts),
+            *merge_notes(
+                (name, part.attrs["notes"]) for name, part in zip(names, parts, strict=True)
+            ),
             *absence_notes(absent),
         ],
         unreadable_rows=sum(part.attrs["unreadable_rows"] for part in parts),
@@ -181,6 +185,11 @@ def _concatenate_parts(
     return joined
 
 
+def _axis_column(part: xr.Dataset, signal: str, axis: str) -> Any | None:
+    names = _axis_names(part)
+    return select_part(part[signal].data, names.index(axis)) if axis in names else None
+
+
 def _files_without(groups: list[list[xr.Dataset]], holders: set[int]) -> list[str]:
     """Name the files that lack something which other files of their group contain."""
     return [
@@ -190,27 +199,6 @@ def _files_without(groups: list[list[xr.Dataset]], holders: set[int]) -> list[st
         for part in group
         if id(part) not in holders
     ]
-
-
-def _stack_signal(parts: list[xr.Dataset], signal: str, axes: list[str]) -> Any:
-    """Stack the signal of all parts, (axis, row); NaN where a part lacks an axis."""
-    rows = []
-    for axis in axes:
-        columns = []
-        for part in parts:
-            names = _axis_names(part)
-            columns.append(
-                select_part(part[signal].data, names.index(axis))
-                if axis in names
-                else _blank_column(part)
-            )
-        rows.append(concatenate_columns(columns, CHUNK_ROWS))
-    return stack_rows(rows)
-
-
-def _blank_column(part: xr.Dataset) -> NDArray[np.float64]:
-    """Return a column of NaN that takes no memory."""
-    return np.broadcast_to(np.nan, (part.sizes["row"],))
 
 
 def with_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
@@ -236,19 +224,17 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
                 )
                 raise OptionError(f"channel {channel!r} of {name} is in the log too; {fix}")
             pieces.setdefault(channel, []).append((stamps, values, units))
-    for channel, channel_pieces in pieces.items():
-        if len({units for _, _, units in channel_pieces}) > 1:
+    for channel, (stamps, values, units) in (
+        (channel, zip(*parts, strict=True)) for channel, parts in pieces.items()
+    ):
+        if len(set(units)) > 1:
             raise UnitError(
                 f"channel {channel!r} has different units in {list_some(files)}; give one with "
                 f"--unit {channel}=UNIT"
             )
-        stamps, values = (
-            np.concatenate([piece[place] for piece in channel_pieces]) for place in (0, 1)
-        )
-        order = np.argsort(stamps, kind="stable")
-        dim = f"time_{channel}"
-        log = log.assign_coords({dim: (dim, stamps[order])}).assign(
-            {channel: (dim, values[order], {"units": channel_pieces[0][2]})}
+        order, dim = np.argsort(np.concatenate(stamps), kind="stable"), f"time_{channel}"
+        log = log.assign_coords({dim: (dim, np.concatenate(stamps)[order])}).assign(
+            {channel: (dim, np.concatenate(values)[order], {"units": units[0]})}
         )
     if files:
         notes = [note for source in sources for note in source.attrs.get("notes", [])]

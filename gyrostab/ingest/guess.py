@@ -64,16 +64,15 @@ _COUNTER_WORD = re.compile(
     r"count|packet|seq|index|sample|(^|[^a-z])(n|no|nr|id|row|frame)($|[^a-z])"
 )
 
-#: Unix time between 2001 and 2033 is 1 to 2 of these.
-_EPOCHS = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18}
-
 _TIME_UNIT_PATTERNS = (
     (r"nanos|(^|[^a-z])ns$|_ns|nsec", "ns"),
     (r"micros|usec|timeus|(^|[^a-z])us$|_us", "us"),
     (r"millis|msec|(^|[^a-z])ms$|_ms", "ms"),
     (r"seconds|(^|[^a-z])s$|_sec$|_s$", "s"),
 )
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_UNITS = ("s", "ms", "us", "ns")
+#: Unix time between 2001 and 2033 is 1 to 2 of these [s].
+_EPOCH_S = 1e9
 
 
 @dataclass(frozen=True)
@@ -201,7 +200,7 @@ def _guess_time(
             or column.rows < 0.5 * inspection.rows
             or column.rising < 0.5
             or column.rising + column.held < 0.95
-            or not column.pace * max(_SECONDS.values()) * MAX_RATE_HZ >= 1  # too fast in any unit
+            or not column.pace * MAX_RATE_HZ >= 1  # too fast in any unit
         ):
             continue
         low = column.key.lower()
@@ -234,11 +233,11 @@ def _time_unit(column: ColumnInspection) -> tuple[str, str]:
     for pattern, unit in _TIME_UNIT_PATTERNS:
         if re.search(pattern, name):
             return unit, "its name"
-    for unit, scale in _EPOCHS.items():
-        if 1.0 <= column.first / scale < 2.0:
+    for unit in _UNITS:
+        if 1.0 <= column.first * _unit_seconds(unit) / _EPOCH_S < 2.0:
             return unit, "its size, that of Unix time"
-    unit = min(_SECONDS, key=lambda unit: _rate_distance(column, unit))
-    return unit, f"the rate of {1.0 / (column.pace * _SECONDS[unit]):.4g} Hz that it gives"
+    unit = min(_UNITS, key=lambda unit: _rate_distance(column, unit))
+    return unit, f"the rate of {1.0 / (column.pace * _unit_seconds(unit)):.4g} Hz that it gives"
 
 
 def _rate_distance(column: ColumnInspection, unit: str) -> float:

@@ -51,7 +51,6 @@ class ColumnInspection(ColumnSummary):
     rising: float
     whole: bool
     first: float
-    last: float
     pace: float
     rate_hz: float
 
@@ -181,7 +180,7 @@ def _inspect_column(
     for values in _value_chunks(log[name]) if name in log.data_vars else ():
         if not values.size:
             continue
-        first, last = values[[0, -1]]
+        first = values[0]
         away = values - (chunks[0][0] if chunks else first)
         steps = np.diff(values)
         scatter = 0.0
@@ -191,13 +190,13 @@ def _inspect_column(
         is_whole, is_held, is_rising = values == np.rint(values), steps == 0, steps > 0
         counts = values.size, steps.size, is_whole.sum(), is_held.sum(), is_rising.sum()
         sums = away.sum(), (away**2).sum(), scatter
-        chunks.append((first, last, values.min(), values.max(), *sums, *counts))
+        chunks.append((first, values.min(), values.max(), *sums, *counts))
         paces += _mean_steps(values)
-    table = np.array(chunks, dtype=np.float64).reshape(-1, 12)
+    table = np.array(chunks, dtype=np.float64).reshape(-1, 11)
     has_values = len(table) > 0
-    total, squares, scatters, rows, steps_seen, wholes, held, rising = table[:, 4:].sum(axis=0)
-    ends = (table[0, 0], table[-1, 1], table[:, 2].min(), table[:, 3].max()) if has_values else ()
-    first, last, low, high = ends or (math.nan,) * 4
+    total, squares, scatters, rows, steps_seen, wholes, held, rising = table[:, 3:].sum(axis=0)
+    ends = (table[0, 0], table[:, 1].min(), table[:, 2].max()) if has_values else ()
+    first, low, high = ends or (math.nan,) * 3
     variance = max(0.0, squares / rows - (total / rows) ** 2) if has_values else math.nan
     size = log[name].size if name in log.data_vars else log.sizes.get("row", 1)
     return ColumnInspection(
@@ -212,7 +211,6 @@ def _inspect_column(
         rising=float(rising / max(1, steps_seen)),
         whole=bool(rows > 0 and wholes > WHOLE_SHARE * rows),
         first=float(first),
-        last=float(last),
         pace=float(np.median(paces)) if paces else math.nan,
         rate_hz=row_rate_hz * float(rows) / max(1, size),
     )

@@ -11,7 +11,8 @@ import xarray as xr
 from gyrostab.errors import OptionError
 from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS
 from gyrostab.store.write import declare_counts
-from gyrostab.time.grid import check_rate, check_span, stamp_ns, time_coordinate
+from gyrostab.time.grid import check_rate, check_span, time_coordinate
+from gyrostab.time.stamps import stamp_ns
 from gyrostab.units import INNER, parse_unit
 
 

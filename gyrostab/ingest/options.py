@@ -10,7 +10,8 @@ import numpy as np
 
 from gyrostab.errors import OptionError
 from gyrostab.ingest.limits import check_limits
-from gyrostab.time.grid import check_rate, stamp_ns
+from gyrostab.time.grid import check_rate
+from gyrostab.time.stamps import stamp_ns
 
 
 @dataclass(frozen=True, kw_only=True)

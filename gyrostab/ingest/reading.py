@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from threading import Event
 from typing import Any, cast
 
 import xarray as xr
 
-from gyrostab.errors import FormatError, GyrostabError, OptionError, reading_of
+from gyrostab.errors import FormatError, GyrostabError, OptionError
 from gyrostab.ingest.columns.pieces import SPILL_BYTES, Spool
 from gyrostab.ingest.combine import attach_channels, concatenate, memory_bytes, move_to_disk
-from gyrostab.ingest.concat import concatenate_logs, log_span
+from gyrostab.ingest.concat.core import concatenate_logs
+from gyrostab.ingest.concat.grid import log_span
 from gyrostab.ingest.damaged_files import (
     add_lost_notes,
     check_share,
@@ -25,15 +21,12 @@ from gyrostab.ingest.damaged_files import (
     is_damage,
     reason_of,
 )
-from gyrostab.ingest.files import expand, find_reader, read_file, scan_file
-from gyrostab.ingest.formats import text as text_format
+from gyrostab.ingest.files import expand, read_file, scan_file
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.ingest.overlap import stamp_span
 from gyrostab.ingest.uniform import check_same_rate
 from gyrostab.schema import texts
 
-#: Text files that are read in parallel.
-_FILES_AHEAD = 2
 #: Called with the number of a file, the number of files and the path.
 OnFile = Callable[[int, int, Path], None]
 #: Reads one file in place of `read_file`.
@@ -134,7 +127,7 @@ def read_log(
     )
     files = expand(paths)
     extra = expand(options.channel) if options.channel else []
-    parts, lost = _read_all(files, options, on_file, read)
+    parts, lost = _read_all(files, options, on_file, read or read_file)
     regular = [path for path, part in parts.items() if "sampling_rate_hz" in part.attrs]
     if regular and len(regular) < len(parts):
         raw = next(path for path in parts if path not in regular)
@@ -219,67 +212,30 @@ def read_channel(
 
 
 def _read_all(
-    paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None, read_one: ReadFile | None
+    paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None, read_one: ReadFile
 ) -> tuple[dict[Path, xr.Dataset], dict[Path, str]]:
     """Read the files one by one; move them to disk when they exceed the memory limit together."""
     parts: dict[Path, xr.Dataset] = {}
     lost: dict[Path, str] = {}
     spool = Spool()
     held = 0
-    with closing(_read_ahead(paths, options, on_file, read_one)) as reading:
-        for path, read in zip(paths, reading, strict=True):
-            try:
-                part = read()
-            except (GyrostabError, OSError) as error:
-                if options.strict or len(paths) == 1 or not is_damage(path, error):
-                    raise
-                lost[path] = reason_of(path, error)
-                continue
-            held += memory_bytes(part)
-            if held > SPILL_BYTES and len(paths) > 1:
-                held -= memory_bytes(part)
-                part = move_to_disk(part, spool)
-            parts[path] = part
+    for number, path in enumerate(paths, 1):
+        if on_file is not None:
+            on_file(number, len(paths), path)
+        try:
+            part = read_one(path, options)
+        except (GyrostabError, OSError) as error:
+            if options.strict or len(paths) == 1 or not is_damage(path, error):
+                raise
+            lost[path] = reason_of(path, error)
+            continue
+        held += memory_bytes(part)
+        if held > SPILL_BYTES and len(paths) > 1:
+            held -= memory_bytes(part)
+            part = move_to_disk(part, spool)
+        parts[path] = part
     check_share(lost, len(paths))
     return parts, lost
-
-
-def _read_ahead(
-    paths: Sequence[Path], options: ReadOptions, on_file: OnFile | None, read_one: ReadFile | None
-) -> Generator[Callable[[], xr.Dataset], None, None]:
-    """Yield a function that reads each file; text files are read ahead in threads by default."""
-    stop = Event()
-    with ThreadPoolExecutor(_FILES_AHEAD, thread_name_prefix="gyrostab-file") as pool:
-        waiting: deque[Callable[[], xr.Dataset]] = deque()
-        try:
-            for number, path in enumerate(paths, 1):
-                if on_file is not None:
-                    on_file(number, len(paths), path)
-                early = read_one is None and len(paths) > 1 and _is_text(path)
-                waiting.append(
-                    pool.submit(_read_text, path, options, stop).result
-                    if early
-                    else partial(read_one or read_file, path, options)
-                )
-                if len(waiting) == _FILES_AHEAD:
-                    yield waiting.popleft()
-            while waiting:
-                yield waiting.popleft()
-        finally:
-            stop.set()
-            pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _read_text(path: Path, options: ReadOptions, stop: Event) -> xr.Dataset:
-    with reading_of(path):
-        return text_format.read(path, options, stop=stop.is_set)
-
-
-def _is_text(path: Path) -> bool:
-    try:
-        return find_reader(path) is text_format
-    except (FormatError, OSError):
-        return False  # reading raises the error
 
 
 def _stamp_spans(parts: Mapping[Path, xr.Dataset]) -> dict[Path, tuple[int, int]]:

@@ -332,6 +332,13 @@ class Effect:
         """Map each nonlinear parameter to the values to try on these data."""
         return {}
 
+    def transfer(self, rate: Array) -> Array | None:
+        """Return the output at each rate; None if the effect does more than change single samples.
+
+        Only for effects that reduce the scatter of noise.
+        """
+        return None
+
     def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
         """List the grid points of the nonlinear parameters; empty for all combinations."""
         return []

@@ -260,9 +260,13 @@ class Clipping(Effect):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Clip the signal [degree hour-1]."""
+        return self.transfer(chunk.signal), state
+
+    def transfer(self, rate: Array) -> Array:
+        """Return the clipped rates."""
         if self.limit == 0.0:
-            return chunk.signal, state
-        return np.clip(chunk.signal, self.centre - self.limit, self.centre + self.limit), state
+            return rate
+        return np.clip(rate, self.centre - self.limit, self.centre + self.limit)
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict anomalous samples; means and spectra are not linear in the limit."""

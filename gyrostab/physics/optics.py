@@ -73,12 +73,19 @@ class DeadZone(Effect):
             if state is None:
                 state = keep * chunk.signal[:, :1]
             slow, state = lfilter([1.0 - keep], [1.0, -keep], chunk.signal, zi=state)
-        away = slow - self.centre
+        return chunk.signal + self._zone_change(slow), state
+
+    def _zone_change(self, rate: Array) -> Array:
+        """Return what the zone adds at each rate."""
+        away = rate - self.centre
         inside = np.clip(away, -self.width, self.width)
-        change = (
+        return (
             -inside if self.edge == "offset" else np.where(np.abs(away) < self.width, -inside, 0.0)
         )
-        return chunk.signal + change, state
+
+    def transfer(self, rate: Array) -> Array | None:
+        """Return the output at each rate, without a bandwidth."""
+        return rate + self._zone_change(rate) if math.isinf(self.bandwidth) else None
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict window means reduced by the width on both sides of the zone."""

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from gyrostab.errors import OptionError
 from gyrostab.schema import RESERVED_NAMES
 from gyrostab.time.durations import duration_seconds
-from gyrostab.time.grid import stamp_ns, time_coordinate
+from gyrostab.time.grid import time_coordinate
+from gyrostab.time.stamps import stamp_ns
 from gyrostab.units import INNER, parse_unit
 
 Array = NDArray[np.float64]

@@ -23,10 +23,9 @@ from gyrostab.time.grid import (
     first_stamp,
     grid_index,
     grid_times,
-    stamp_ns,
     time_coordinate,
 )
-from gyrostab.time.stamps import format_stamp, to_nanoseconds
+from gyrostab.time.stamps import format_stamp, stamp_ns, to_nanoseconds
 
 #: Largest number of samples of the instrument: a year at 300 Hz.
 MAX_SAMPLES = 10**10

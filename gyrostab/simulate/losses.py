@@ -14,7 +14,7 @@ from gyrostab.schema import GAP_CAUSES
 from gyrostab.simulate.channels import Points, check_points
 from gyrostab.simulate.noise import stream
 from gyrostab.time.durations import duration_seconds
-from gyrostab.time.grid import stamp_ns
+from gyrostab.time.stamps import stamp_ns
 from gyrostab.units import HOUR
 
 _MISSING, _RESTART = (GAP_CAUSES.index(name) for name in ("missing", "restart"))

@@ -21,7 +21,7 @@ from gyrostab.simulate.noise import FLICKER_LOW
 from gyrostab.simulate.turning import rotation
 from gyrostab.store.toml import parse_toml, read_toml_text
 from gyrostab.time.durations import duration_seconds
-from gyrostab.time.grid import stamp_ns
+from gyrostab.time.stamps import stamp_ns
 
 #: Largest noise coefficient: its square, and sums of squares, stay within the range of numbers.
 _MAX_COEFFICIENT = 1e100

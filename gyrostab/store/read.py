@@ -101,7 +101,9 @@ def _open_dataset(
     engine: Any = "zarr" if path.is_dir() else "netcdf4"
     name = "Zarr" if path.is_dir() else "NetCDF"
     try:
-        stored = xr.open_dataset(path, engine=engine, **_AS_STORED)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # without consolidated metadata
+            stored = xr.open_dataset(path, engine=engine, **_AS_STORED)
     except Exception as error:  # the backends raise errors of many kinds on damaged files
         raise DamageError(
             f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again"

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import re
+from datetime import date
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
-from gyrostab.errors import TimeError
+from gyrostab.errors import OptionError, TimeError
+
+NANOSECONDS = 10**9
+_CLOCK = r"(\d{1,2})(?::(\d{1,2})(?::(\d{1,2})(?:[.,](\d+))?)?)?"
+_ZONE = r"\s*(Z|UTC|GMT|[+-]\d{1,2}(?::?\d{2})?)?"
+_INSTANT = re.compile(
+    rf"(\d{{4}}|1(?=-0?1-))-(\d{{1,2}})-(\d{{1,2}})(?:[T ]\s*{_CLOCK}{_ZONE})?", re.IGNORECASE
+)
+_COMPACT_INSTANT = re.compile(
+    rf"(\d{{4}})(\d\d)(\d\d)(?:[T ](\d\d)(\d\d)(\d\d)(?:[.,](\d+))?{_ZONE})?", re.IGNORECASE
+)
 
 
 def to_nanoseconds(stamps: Any, *, far_as_nat: bool = False) -> NDArray[np.int64]:
@@ -56,3 +69,93 @@ def format_stamp(stamp: int) -> str:
     """
     date = np.datetime64(int(stamp), "ns").astype("datetime64[ms]")
     return "no stamp" if np.isnat(date) else str(date)
+
+
+def split_instant(text: str) -> tuple[int, int, int, int] | None:
+    """Split a date and time into year, month, day and nanoseconds after its midnight UTC.
+
+    Only texts that can be read in one way are split: the year has four digits and comes first (ISO
+    8601, or the form ``2026-1-2 3:4:5 UTC`` that UDUNITS reads). The fields are not checked against
+    a calendar.
+
+    Parameters
+    ----------
+    text : str
+        The date and time; UTC unless it names an offset.
+
+    Returns
+    -------
+    tuple of int or None
+        None when the text has another form.
+
+    Examples
+    --------
+    >>> split_instant("2026-1-2 3:00 +01:00")
+    (2026, 1, 2, 7200000000000)
+    >>> split_instant("01-02-2026") is None
+    True
+    """
+    match = _INSTANT.fullmatch(text.strip()) or _COMPACT_INSTANT.fullmatch(text.strip())
+    if match is None:
+        return None
+    year, month, day, hour, minute, second = (int(group or 0) for group in match.groups()[:6])
+    fraction, zone = match.groups()[6:]
+    seconds = 3600 * hour + 60 * minute + second
+    if seconds > 86400 or minute > 59 or second > 60:
+        return None
+    if zone and zone[0] in "+-":
+        digits = zone[1:].replace(":", "")
+        hours, minutes = (digits, "0") if len(digits) <= 2 else (digits[:-2], digits[-2:])
+        seconds -= int(f"{zone[0]}1") * (3600 * int(hours) + 60 * int(minutes))
+    return year, month, day, seconds * NANOSECONDS + int((fraction or "0")[:9].ljust(9, "0"))
+
+
+def stamp_ns(start: Any, name: str = "start") -> int:
+    """Convert an instant, as text or as nanoseconds since 1970, to nanoseconds since 1970.
+
+    Parameters
+    ----------
+    start : str, int or datetime
+        The instant; text is ISO 8601, UTC unless it says otherwise.
+
+    Raises
+    ------
+    OptionError
+        When it is not a date and time, or outside the years 1678 to 2262.
+
+    Examples
+    --------
+    >>> stamp_ns("1970-01-01T02:00:01+02:00")
+    1000000000
+    """
+    if isinstance(start, int | np.integer):
+        return int(start)
+    try:
+        if isinstance(start, str):
+            stamp = _parse_stamp_ns(start)
+        else:
+            time = pd.Timestamp(start)
+            if pd.isna(time) or isinstance(start, float | np.floating):
+                raise ValueError("no time")
+            stamp = int((time.tz_convert(None) if time.tzinfo else time).as_unit("ns").value)
+    except pd.errors.OutOfBoundsDatetime:
+        stamp = 2**63
+    except (ValueError, TypeError, OverflowError, AttributeError) as error:
+        example = "2026-11-20T14:00:00 (UTC)"
+        raise OptionError(
+            f"{name} {start!r} is not a date and time; write for instance {example}"
+        ) from error
+    if abs(stamp) >= 2**63:
+        raise OptionError(
+            f"{name} {start!r} is outside the years 1678 to 2262, which 64-bit nanoseconds hold; "
+            "give another date"
+        )
+    return stamp
+
+
+def _parse_stamp_ns(text: str) -> int:
+    fields = split_instant(text)
+    if fields is None:
+        raise ValueError("the year does not come first, with four digits")
+    year, month, day, nanoseconds = fields
+    return (date(year, month, day) - date(1970, 1, 1)).days * 86400 * NANOSECONDS + nanoseconds

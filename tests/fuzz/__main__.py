@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
 
-from gyrostab.store.output import replace_file
 from tests.fuzz.campaign import (
     BATCH,
     FORMATS,
@@ -25,7 +24,7 @@ from tests.fuzz.campaign import (
     run_batch,
     server,
 )
-from tests.fuzz.table import page, table
+from tests.fuzz.table import renew_results, results, table
 
 ROOT = Path(__file__).parents[2]
 
@@ -134,7 +133,7 @@ def main() -> int:
     parser.add_argument(
         "--formats", nargs="*", default=list(FORMATS), choices=FORMATS, metavar="FORMAT"
     )
-    parser.add_argument("--output", type=Path, help="Markdown page for the result table")
+    parser.add_argument("--output", type=Path, help="Markdown page with markers for the results")
     parser.add_argument(
         "--work",
         type=Path,
@@ -158,11 +157,8 @@ def main() -> int:
             f"{failure['text']}"
         )
     if given.output:
-        with replace_file(given.output) as part:
-            part.write_text(
-                page(totals, count=given.count, seed=given.seed, jobs=given.jobs, seconds=seconds),
-                encoding="utf-8",
-            )
+        text = results(totals, count=given.count, seed=given.seed, jobs=given.jobs, seconds=seconds)
+        renew_results(given.output, text)
     return int(not complete or any(tally.failures for tally in totals.values()))
 
 

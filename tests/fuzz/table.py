@@ -1,12 +1,13 @@
-"""Write the result table and the page of a campaign."""
+"""Write the results of a campaign."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from pathlib import Path
 
+from gyrostab.store.output import replace_file
 from tests.fuzz.campaign import Tally
-from tests.fuzz.server import LIMIT_BYTES, LIMIT_SECONDS
 
 HEAD = (
     "| input | tried | exit 0 | exit 2 | exit 3 | failures | processor time, mean [ms] | "
@@ -31,8 +32,20 @@ def table(totals: Mapping[str, Tally]) -> str:
     return "\n".join(rows)
 
 
-def page(totals: Mapping[str, Tally], *, count: int, seed: int, jobs: int, seconds: float) -> str:
-    """Return the page on damaged inputs, in Markdown."""
+BEGIN, END = "<!-- campaign: begin -->\n", "<!-- campaign: end -->"
+
+
+def renew_results(page: Path, text: str) -> None:
+    """Replace the results on a page, between its markers, and leave all else as written."""
+    before, rest = page.read_text(encoding="utf-8").split(BEGIN)
+    with replace_file(page) as part:
+        part.write_text(f"{before}{BEGIN}{text}\n{END}{rest.split(END)[1]}", encoding="utf-8")
+
+
+def results(
+    totals: Mapping[str, Tally], *, count: int, seed: int, jobs: int, seconds: float
+) -> str:
+    """Return the results of a campaign, in Markdown, for the page on damaged inputs."""
     tried = sum(tally.codes.total() for tally in totals.values())
     failures = [failure for tally in totals.values() for failure in tally.failures]
     kinds = Counter(
@@ -41,55 +54,11 @@ def page(totals: Mapping[str, Tally], *, count: int, seed: int, jobs: int, secon
     listed = (
         "\n".join(f"- {kind} ({number} inputs)" for kind, number in kinds.most_common()) or "None."
     )
-    done = "" if tried == count else f"\nThe campaign was stopped after {tried} of {count} inputs."
-    return PAGE.format(
-        tried=tried,
-        count=count,
-        seed=seed,
-        jobs=jobs,
-        minutes=seconds / 60.0,
-        speed=tried / max(seconds, 1e-9),
-        table=table(totals),
-        listed=listed,
-        done=done,
-        limit_seconds=LIMIT_SECONDS,
-        limit_memory=LIMIT_BYTES / 2**20,
+    stopped = (
+        "" if tried == count else f" The campaign was stopped after {tried} of {count} inputs."
     )
-
-
-PAGE = """# Damaged and hostile inputs
-
-Whatever a file contains, gyrostab must exit with code 0 (done) or 2 (one message that names the
-file), soon and in bounded memory. A run that continues from a damaged checkpoint may also exit with
-3. Exit code 1, a traceback, a signal, more than {limit_seconds:.0f} s or
-more than {limit_memory:.0f} MiB of additional memory for one of these tiny
-inputs is a failure. An exception that the code of gyrostab raises is also a failure, even if it is
-reported as a damaged file (`gyrostab.errors.DamageError`).
-
-The inputs start from small valid files of every format. A mutator flips bits, overwrites counters
-and sizes with critical integers, cuts, inserts, repeats and splices bytes, replaces tokens of text,
-and removes or exchanges files of a folder. The rows *odd logs*, *odd options* and *odd models* are
-well-formed inputs that hypothesis draws from grammars: stamps with bursts, repeats and clock steps,
-extreme numbers, names and units. Each input is passed to `scan`, `ingest`, `run`, `davar` or
-`simulate`. A child process, in which the program is already loaded, runs the commands; every input
-is determined by the seed, the format and its number.
-
-    make fuzz N=100000   # SEED=1 JOBS=2; start it again to continue a stopped campaign
-    python -m tests.fuzz --replay fuzz-output/failures
-
-## Results
-
-Seed {seed}, jobs {jobs}: {tried} inputs took {minutes:.1f} minutes,
-{speed:.0f} inputs per second.{done}
-
-{table}
-
-*Largest memory* is the growth of the resident memory during one call.
-
-Failures:
-
-{listed}
-
-A short campaign is part of `make test-full`. Inputs that once failed are regression tests in
-`tests/fuzz/regressions`.
-"""
+    return (
+        f"Seed {seed}, jobs {jobs}: {tried} inputs took {seconds / 60.0:.1f} minutes, "
+        f"{tried / max(seconds, 1e-9):.0f} inputs per second.{stopped}\n\n"
+        f"{table(totals)}\n\nFailures:\n\n{listed}"
+    )

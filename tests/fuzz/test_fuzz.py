@@ -8,10 +8,20 @@ from pathlib import Path
 
 import pytest
 
-from tests.fuzz.campaign import FORMATS, Input, load_input, make_input, run_batch, seeds, server
+from tests.fuzz.campaign import (
+    FORMATS,
+    Input,
+    Tally,
+    load_input,
+    make_input,
+    run_batch,
+    seeds,
+    server,
+)
 from tests.fuzz.child import call, own_fault
 from tests.fuzz.seeds import move_job
 from tests.fuzz.server import arguments_of
+from tests.fuzz.table import BEGIN, END, renew_results, results
 
 REGRESSIONS = Path(__file__).parent / "regressions"
 SEED = 7
@@ -29,6 +39,18 @@ def test_every_seed_is_read() -> None:
                 if outcome.code != 0:
                     wrong.append((seed.format, seed.main, command, outcome.code, outcome.text))
     assert not wrong, "\n".join(map(str, wrong))
+
+
+def test_results_of_a_campaign_leave_the_text_of_their_page(tmp_path: Path) -> None:
+    written = (Path(__file__).parents[2] / "docs" / "fuzzing.md").read_text(encoding="utf-8")
+    page = tmp_path / "fuzzing.md"
+    page.write_text(written, encoding="utf-8")
+    totals = {"text": Tally()}
+    renew_results(page, results(totals, count=10, seed=3, jobs=1, seconds=60.0))
+    renewed = page.read_text(encoding="utf-8")
+    assert "Seed 3, jobs 1: 0 inputs took 1.0 minutes" in renewed
+    assert renewed.split(BEGIN)[0] == written.split(BEGIN)[0]
+    assert renewed.split(END)[1] == written.split(END)[1]
 
 
 @pytest.mark.full

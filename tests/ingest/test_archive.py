@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from gyrostab import make_log
 from gyrostab.errors import OptionError, TimeError, UnitError
 from gyrostab.ingest import read_log
-from gyrostab.ingest.concat import concatenate_logs
+from gyrostab.ingest.concat.core import concatenate_logs
 from gyrostab.ingest.concat.grid import runs_of
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.place import append_runs

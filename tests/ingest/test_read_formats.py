@@ -447,3 +447,13 @@ def test_buffers_spill_to_disk_and_read_back(monkeypatch: pytest.MonkeyPatch) ->
     np.testing.assert_array_equal(
         second[:], np.array(["2026-01-01", "NaT"], dtype="datetime64[ns]")
     )
+
+
+def test_attributes_of_a_classic_file_may_have_any_name(tmp_path: Path) -> None:
+    with netCDF4.Dataset(tmp_path / "log.nc", "w", format="NETCDF3_CLASSIC") as file:
+        file.setncatts({"variables": "gyro_x", "dimensions": "n", "fp": 1, "_recs": 5})
+        file.createDimension("n", None)
+        gyro = file.createVariable("gyro_x", "i2", ("n",))
+        gyro.units = "deg/h"
+        gyro[:] = [1, 2, 3]
+    assert read_log(tmp_path / "log.nc", rate=10.0).rate.values.tolist() == [[1.0, 2.0, 3.0]]

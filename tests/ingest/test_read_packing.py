@@ -264,7 +264,7 @@ def write_regular(
     [
         "plain",
         "scale and offset",
-        "several missing",
+        "fill",
         "valid range, packed",
         "valid max",
         "unsigned, packed",
@@ -278,34 +278,38 @@ def test_regular_log_of_another_program_is_decoded_like_a_raw_log(tmp_path, case
     assert log.time.values[5] == np.datetime64("2026-01-01T00:00:00.05")
 
 
+def test_samples_of_a_regular_log_that_were_not_written_are_missing(tmp_path):
+    values = np.append(np.linspace(1.0, 2.0, ROWS - 1), netCDF4.default_fillvals["f8"])
+    rate = read_log(write_regular(tmp_path / "log.nc", values, {})).rate.values[0]
+    assert np.flatnonzero(np.isnan(rate)).tolist() == [ROWS - 1]
+    np.testing.assert_allclose(rate[: ROWS - 1], values[:-1])
+
+
 @pytest.mark.parametrize(
     ("attribute", "value"), [("calendar", "noleap"), ("units", "seconds since now")]
 )
 def test_regular_log_with_a_climate_calendar_is_refused(tmp_path, attribute, value):
-    with pytest.raises(UnitError, match=f"log.nc: variable 'time': .*{value}"):
+    with pytest.raises(UnitError, match=f"log.nc: column 'time': .*{value}"):
         read_log(write_regular(tmp_path / "log.nc", COUNTS, {}, **{attribute: value}))
 
 
-def test_an_unwritten_sample_of_a_regular_log_is_missing(tmp_path):
-    path = write_regular(tmp_path / "log.nc", COUNTS.astype("f4"), {})
-    with netCDF4.Dataset(path, "a") as file:
-        file.variables["rate"].set_auto_mask(False)
-        file.variables["rate"][0, 3] = netCDF4.default_fillvals["f4"]
-    assert np.flatnonzero(np.isnan(read_log(path).rate.values[0])).tolist() == [3]
-
-
 @pytest.mark.parametrize("regular", [True, False])
-@pytest.mark.parametrize("named", [True, False])
-def test_default_fill_value_of_zarr_is_ignored(tmp_path, named, regular):
+def test_default_fill_value_of_zarr_is_ignored(tmp_path, regular):
     """Zarr writes a fill value of 0 by default, but samples of 0 are values."""
     path = tmp_path / "log.zarr"
     if regular:
-        if not named:
-            pytest.skip("a regular log names its dimensions")
         write_regular(path, COUNTS, {"_FillValue": np.int16(0)}, zarr_format=2)
     else:
         group = zarr.open_group(path, mode="w", zarr_format=2)
         for name, values, unit in (("time", np.arange(ROWS), "s"), ("gyro_x", COUNTS, "deg/h")):
-            attributes = {"units": unit} | ({"_ARRAY_DIMENSIONS": ["obs"]} if named else {})
+            attributes = {"units": unit, "_ARRAY_DIMENSIONS": ["obs"]}
             group.create_array(name, data=values).attrs.update(attributes)
     np.testing.assert_array_equal(read_log(path).rate.values[0], COUNTS)
+
+
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_a_zarr_array_that_does_not_name_its_dimensions_is_refused(tmp_path, zarr_format):
+    group = zarr.open_group(tmp_path / "log.zarr", mode="w", zarr_format=zarr_format)
+    group.create_array("gyro_x", data=COUNTS)
+    with pytest.raises(FormatError, match=r"log.zarr: an array does not name its dimensions"):
+        read_log(tmp_path / "log.zarr")

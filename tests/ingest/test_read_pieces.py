@@ -1,9 +1,7 @@
-"""Columns in pieces, in memory and on disk, and files that are read ahead."""
+"""Columns in pieces, in memory and on disk."""
 
 from __future__ import annotations
 
-import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +14,6 @@ from gyrostab.ingest import read_log, reading
 from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.columns.pieces import EvenPiece, Spool, find_even, find_line
 from gyrostab.ingest.columns.raw_log import clean_column
-from gyrostab.ingest.formats import text
-from gyrostab.ingest.text.cells import BlockParser
 from gyrostab.kernels.grid.stamps import NO_STAMP, new_state, place
 from gyrostab.store.lazy import concatenate_columns, read_into, read_slice
 from gyrostab.store.threads import map_in_order
@@ -93,30 +89,6 @@ def test_log_in_pieces_equals_the_plain_log(tmp_path, monkeypatch, module, decim
     assert piecewise.rate.chunks is not None
     xr.testing.assert_identical(piecewise.compute(), plain)
     np.testing.assert_array_equal(bits(piecewise.rate.compute().values), bits(plain.rate.values))
-
-
-def test_reading_ahead_stops_with_an_error(tmp_path, monkeypatch):
-    paths = [
-        text_log(tmp_path / f"{number}.csv", 2000 * number, 2000, decimals=3) for number in range(3)
-    ]
-    sizes: list[int] = []
-    take = BlockParser.parse
-
-    def slowly(self, block):
-        time.sleep(0.005)
-        sizes.append(len(block))
-        return take(self, block)
-
-    def refuse(number, count, path):
-        if number == 2:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(BlockParser, "parse", slowly)
-    monkeypatch.setattr(text, "BLOCK_BYTES", 256)
-    with pytest.raises(KeyboardInterrupt):
-        read_log(paths, on_file=refuse)
-    assert sum(sizes) < paths[0].stat().st_size / 3
-    assert not [thread for thread in threading.enumerate() if thread.name.startswith("gyrostab-")]
 
 
 def test_even_stamps_are_placed_like_nearly_even_ones():

@@ -21,7 +21,7 @@ from gyrostab.errors import FormatError, OptionError, UnitError
 from gyrostab.ingest import read_log, scan_file
 from gyrostab.ingest.columns.stamps import NAT, integers_to_ns, parse_time_unit
 from gyrostab.ingest.grid.regularise import regularise
-from gyrostab.time.grid import stamp_ns
+from gyrostab.time.stamps import stamp_ns
 
 ROWS = 40
 

@@ -25,8 +25,9 @@ def write_foreign(path: Path, zarr_format: int) -> None:
     blosc = zarr.codecs.BloscCodec() if zarr_format == 3 else numcodecs.Blosc("lz4", shuffle=1)
     for name, unit in (("time", "s"), ("gyro_x", "deg/h"), ("gyro_y", "deg/h")):
         values = np.arange(500) * 0.1 if name == "time" else draw.standard_normal(500)
+        named = {"dimension_names": ["obs"]} if zarr_format == 3 else {}
         array = group.create_array(
-            name, shape=values.shape, chunks=(200,), dtype="f8", compressors=blosc
+            name, shape=values.shape, chunks=(200,), dtype="f8", compressors=blosc, **named
         )
         array[:] = values
         array.attrs.update({"units": unit, "_ARRAY_DIMENSIONS": ["obs"]})

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from gyrostab import make_log, open_product, to_netcdf, to_zarr
 from gyrostab.allan.fit import fit_noise, fit_part
 from gyrostab.ingest.columns.pieces import Spool
-from gyrostab.ingest.concat import concatenate_logs
+from gyrostab.ingest.concat.core import concatenate_logs
 from gyrostab.ingest.concat.lazy import place_on_grid
 from gyrostab.ingest.grid import fill
 from gyrostab.ingest.grid.place import Placement

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
+import pytest
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
+
+from gyrostab import regularise
+from gyrostab.ingest.grid import scan_pass
 
 START = 1_773_226_800_000_000_000  # 2026-03-11T11:00:00
 
@@ -48,3 +53,15 @@ def expected(samples: ArrayLike) -> NDArray[np.float64]:
     out = np.full(of.max() + 1, np.nan)
     out[of[of >= 0]] = np.flatnonzero(of >= 0) + 1.0
     return out
+
+
+def regularise_in_parts(
+    raw: xr.Dataset, *, block: int = scan_pass.BLOCK_ROWS, chunk: int | None = None, **options: Any
+) -> xr.Dataset:
+    """Regularise with other numbers of rows in memory and of samples in a chunk."""
+    module = sys.modules["gyrostab.ingest.grid.regularise"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scan_pass, "BLOCK_ROWS", block)
+        if chunk is not None:
+            patch.setattr(module, "chunk_samples", lambda rate: chunk)
+        return regularise(raw, **options)

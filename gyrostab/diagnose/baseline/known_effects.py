@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, band_columns
 from gyrostab.diagnose.baseline.known_lines import average_in_bands, expect_lines, resonance_density
+from gyrostab.diagnose.baseline.sample_transfer import undo_transfer
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import (
     cross_without,
@@ -23,9 +24,10 @@ from gyrostab.diagnose.predict.windows import complex_factors, predict_effect
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.physics.base import Effect
-from gyrostab.physics.logger import LoggerFilter
+from gyrostab.physics.logger_filter import LoggerFilter
 from gyrostab.physics.prediction import Prediction
 from gyrostab.simulate.model import Model
+from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
 _EVERYWHERE = "lattice"  # the anomaly of every sample
@@ -56,6 +58,7 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
     axes = [str(axis) for axis in blocks["axis"].values]
     shape = (len(axes), blocks.sizes["block"], blocks.sizes["band"])
     mean, random = np.zeros(shape[:2]), _RandomMeans(shape)
+    left = np.ones(shape[:2])  # share of the noise
     squares = np.repeat(square[:, None], shape[1], axis=1)
     # factors of filters on the noise terms, (axis, band, term)
     added, response = np.zeros(shape), np.ones((shape[0], shape[2], len(NOISE)))
@@ -72,6 +75,7 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
         has_anomalous_samples = bool({*prediction.marks} - {_EVERYWHERE})
         if has_anomalous_samples or _shows_elsewhere(prediction):
             left_out.append(effect.name)
+        left[rows] *= _share_left(effect, model, rows, blocks)
         if has_anomalous_samples:
             continue  # such blocks are found and left out
         for name, values in prediction.mean.items():
@@ -91,12 +95,25 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
         random.add(prediction, rows, sizes)
     white_response = response[:, None, :, NOISE.index("N")]
     noise = np.einsum("fn,afn,abn->abf", band_columns(blocks), response, np.maximum(squares, 0.0))
-    spectrum = spread_by_gaps(noise + added * white_response, blocks)
+    spectrum = spread_by_gaps((noise + added * white_response) * left[..., None], blocks)
     variables = _shared_cross(coherent, white_response, blocks)
     if narrow and "line_power" in blocks:
         variables |= expect_lines(blocks, narrow, white_response[:, 0])
     white_share = 1.0 - random.power / spectrum[..., 0]
     return KnownEffects(mean, spectrum, white_share, variables | random.variables(), left_out)
+
+
+def _share_left(effect: Effect, model: Model, rows: list[int], blocks: xr.Dataset) -> Array:
+    """Return the share of the noise that an effect on single samples leaves, (row, block)."""
+    share = np.ones((len(rows), blocks.sizes["block"]))
+    if effect.transfer(np.zeros(1)) is None:
+        return share
+    rate = float(blocks.attrs["sampling_rate_hz"]) * float(model.log.get("oversampling", 1))
+    for place, row in enumerate(rows):
+        variance = model.coefficients(str(blocks["axis"].values[row]))["N"] ** 2 * HOUR * rate
+        mean = blocks["mean"].values[row]
+        share[place] = undo_transfer(effect.transfer, mean, variance, known=True).share
+    return share
 
 
 def _added_powers(

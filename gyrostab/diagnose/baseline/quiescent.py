@@ -15,7 +15,7 @@ from gyrostab.diagnose.reduce.block_statistics import iso
 from gyrostab.diagnose.reduce.schema import weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError
-from gyrostab.time.grid import stamp_ns
+from gyrostab.time.stamps import stamp_ns
 
 Array = NDArray[np.float64]
 #: Blocks over which the noise level is averaged. Design choice.

@@ -1,22 +1,22 @@
-"""Estimate the constant rate of each axis, and undo a truncation of the values towards zero."""
+"""Estimate the constant rate and the noise of each axis before effects on single samples."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.baseline.sample_transfer import PassedNoise, undo_transfer
 from gyrostab.diagnose.predict.windows import predict_effect
 from gyrostab.diagnose.reduce.schema import weighted_mean
 from gyrostab.physics.base import Effect
-from gyrostab.physics.logger import RateQuantization
 from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
-_ROUNDS = 200  # of a fixed-point iteration that halves its error in about one
-_MAX_LEVELS = 4000  # of a truncated normal law, beyond which it is as good as continuous
+_MIN_GAIN = 0.05  # of slow changes; with less, the record does not show them
 
 
 def constant_rates(
@@ -41,7 +41,10 @@ def constant_rates(
     """
     axes = tuple(str(axis) for axis in blocks["axis"].values)
     rate = blocks["mean"].values.copy()
+    changed = _changed_rows(axes, effects)
     for effect in effects:
+        if any(effect is other for _, other in changed):
+            continue
         effect_axes = tuple(axis for axis in axes if not effect.axes or axis in effect.axes)
         rows = [axes.index(axis) for axis in effect_axes]
         for name, design in predict_effect(effect, blocks, effect_axes).mean.items():
@@ -49,73 +52,52 @@ def constant_rates(
             rate[rows] -= sizes[:, None] * np.atleast_2d(design)
     if turning in axes and "channel_rotation_rate" in blocks:
         rate[axes.index(turning)] -= HOUR * blocks["channel_rotation_rate"].values
+    for row, effect in changed:
+        recorded = blocks["mean"].values[row]
+        rate[row] += _noise_before(effect, blocks, row).mean - recorded
     means, _ = weighted_mean(rate, blocks["samples"].values, axis=1)
-    for row, step in _truncated_rows(axes, effects):
-        recorded, variance = _moments_of_axis(blocks, row)
-        means[row] += _undo_truncation(recorded, variance, step)[0] - recorded
     return dict(zip(axes, means.tolist(), strict=True))
 
 
-def noise_lost_by_truncation(blocks: xr.Dataset, effects: Sequence[Effect]) -> dict[str, float]:
-    """Return the variance of the noise that values cut off towards zero lack, by axis.
+def undo_noise_loss(
+    noise: Mapping[str, Mapping[str, float]], blocks: xr.Dataset, effects: Sequence[Effect]
+) -> dict[str, dict[str, float]]:
+    """Return the noise coefficients by axis and term, as before effects that reduce the noise.
 
-    Rounding adds the square of the step over 12 to the variance, which is taken out of the noise.
-    Truncation towards zero moves all values inwards, and may reduce the variance.
+    Truncation towards zero, limits and dead zones change each sample for itself. Rounding adds the
+    square of the step over 12 to the variance, which is taken out of the noise.
     """
-    axes = tuple(str(axis) for axis in blocks["axis"].values)
-    out = {}
-    for row, step in _truncated_rows(axes, effects):
-        mean, variance = _moments_of_axis(blocks, row)
-        variance_before = _undo_truncation(mean, variance, step)[1]
-        out[axes[row]] = variance_before - (variance - step**2 / 12.0)
+    out = {axis: dict(terms) for axis, terms in noise.items()}
+    axes, rate = tuple(out), float(blocks.attrs["sampling_rate_hz"])
+    for row, effect in _changed_rows(axes, effects):
+        passed = _noise_before(effect, blocks, row)
+        added = getattr(effect, "step", 0.0) ** 2 / 12.0
+        lost = passed.variance - (_variance_of_axis(blocks, row) - added)
+        terms = out[axes[row]]
+        terms["N"] = float(f"{math.sqrt(max(terms['N'] ** 2 + lost / (HOUR * rate), 0.0)):.6g}")
+        for term in ("B", "K"):
+            terms[term] = float(f"{terms[term] / max(passed.gain, _MIN_GAIN):.6g}")
     return out
 
 
-def _moments_of_axis(blocks: xr.Dataset, row: int) -> tuple[float, float]:
-    """Return the mean of the record, and the variance of the samples about their block means."""
-    mean, variance = (
-        weighted_mean(blocks[name].values[row], blocks["samples"].values[row])[0]
-        for name in ("mean", "variance")
-    )
-    return float(mean), float(variance)
+def _variance_of_axis(blocks: xr.Dataset, row: int) -> float:
+    """Return the variance of the samples of an axis about their block means."""
+    variance = blocks["variance"].values[row]
+    return float(weighted_mean(variance, blocks["samples"].values[row])[0])
 
 
-def _truncated_rows(axes: tuple[str, ...], effects: Sequence[Effect]) -> list[tuple[int, float]]:
-    """Return rows and steps of the axes whose values are cut off towards zero."""
+def _changed_rows(axes: tuple[str, ...], effects: Sequence[Effect]) -> list[tuple[int, Effect]]:
+    """Return rows of the axes, and the effects that reduce their noise sample by sample."""
     return [
-        (row, effect.step)
+        (row, effect)
         for effect in effects
-        if isinstance(effect, RateQuantization) and effect.mode == "zero" and effect.step > 0.0
+        if effect.transfer(np.zeros(1)) is not None
         for row, axis in enumerate(axes)
         if not effect.axes or axis in effect.axes
     ]
 
 
-def _undo_truncation(mean: float, variance: float, step: float) -> tuple[float, float]:
-    """Return mean and variance of the normal law that has these after truncation towards zero.
-
-    Examples
-    --------
-    >>> x = np.random.default_rng(1).normal(0.7, 1.5, 1_000_000)
-    >>> mean, variance = np.trunc(x).mean(), np.trunc(x).var()
-    >>> moments = (mean, variance, *_undo_truncation(mean, variance, 1.0))
-    >>> [round(float(moment), 2) for moment in moments]
-    [0.52, 1.43, 0.7, 2.24]
-    """
-    from scipy.special import ndtr
-
-    target, spread = mean / step, variance / step**2
-    centre, square = target, max(spread, 1e-3)
-    reach = abs(target) + 12.0 * (np.sqrt(square) + 1.0)
-    if reach > _MAX_LEVELS:  # half a step towards zero, as far as it keeps its sign
-        return mean + 0.5 * step * float(np.sign(mean)), variance - step**2 / 12.0
-    level = np.arange(-np.ceil(reach), np.ceil(reach) + 1.0)
-    low, high = level - (level <= 0.0), level + (level >= 0.0)
-    for _ in range(_ROUNDS):
-        sigma = np.sqrt(square)
-        share = ndtr((high - centre) / sigma) - ndtr((low - centre) / sigma)
-        level_mean = float(share @ level)
-        level_variance = float(share @ (level - level_mean) ** 2)
-        centre += target - level_mean
-        square = max(square + spread - level_variance, 1e-3)
-    return centre * step, square * step**2
+def _noise_before(effect: Effect, blocks: xr.Dataset, row: int) -> PassedNoise:
+    """Return the noise of an axis before an effect."""
+    mean = blocks["mean"].values[row]
+    return undo_transfer(effect.transfer, mean, _variance_of_axis(blocks, row))

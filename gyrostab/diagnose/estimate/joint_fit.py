@@ -26,9 +26,9 @@ from gyrostab.diagnose.statistics.spectral_line import line_quality
 from gyrostab.errors import GyrostabError
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.base import Effect
+from gyrostab.physics.earth_rate import EarthRate
 from gyrostab.physics.prediction import Windows
 from gyrostab.physics.registry import effects
-from gyrostab.physics.rotation import EarthRate
 
 _ANGLE = "deg"
 _TAIL = float(ndtr(-NORMAL_95))  # beyond either end of an interval
@@ -286,8 +286,11 @@ def _model_settings(
         and truncated_axes(state.blocks)[state.axes.index(component.row[0])]
     ):
         return {"mode": "zero"}
-    if identification.effect == "dead_zone" and has_empty_zone(state.blocks, component.row[0]):
-        return {"edge": "jump"}
+    if identification.effect == "dead_zone":
+        axis = component.row[0]
+        centre = float(np.nan_to_num(state.blocks["zone_centre"].sel(axis=axis)))
+        edge = "jump" if has_empty_zone(state.blocks, axis) else "offset"
+        return {"centre": centre, "edge": edge}
     if identification.effect == "spikes":
         return {"kind": "outlier"}
     if identification.effect == "earth_rate" and is_reversed(component):

@@ -83,10 +83,10 @@ def average_sizes(
         - state.settings.form_error_share * max(component.evidence_nats, 0.0)
     ]
     if without_lag:
-        plain = _merge_points([points[place] for place in without_lag])
-        middle, _ = plain.moments()
+        at_zero_lag = _merge_points([points[place] for place in without_lag])
+        middle, _ = at_zero_lag.moments()
         mean, covariance = middle, covariance + np.outer(middle - mean, middle - mean)
-        supported.append(plain)
+        supported.append(at_zero_lag)
     ends = _size_interval(mean, covariance, supported)
     weighed = evidence + np.log([point.share for point in points])
     share = np.exp(weighed - np.logaddexp.reduce(weighed))

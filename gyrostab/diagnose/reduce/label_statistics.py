@@ -19,7 +19,7 @@ from gyrostab.diagnose.reduce.log_blocks import channel_means, numeric_channels
 from gyrostab.diagnose.reduce.outliers import count_outliers, quantization_step, zeros_beyond_chance
 from gyrostab.diagnose.reduce.rotation_orders import HARMONICS
 from gyrostab.diagnose.reduce.schema import COORDINATES, label_variables, weighted_mean
-from gyrostab.diagnose.reduce.zero_bin import BINS, bin_widths, empty_zone
+from gyrostab.diagnose.reduce.zero_bin import BINS, bin_widths, empty_zone, sticking_value
 from gyrostab.kernels.regression.smooth import smooth_curve
 from gyrostab.schema import GAP_CAUSES, texts
 from gyrostab.time.grid import grid_index, grid_times
@@ -47,13 +47,23 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     # on a quantization grid equal values are frequent by chance
     resent = np.where(steps[:, None, None] > 0.0, 0, by_name["resent"])
     widths = np.array([bin_widths(_kept_values(work, row), step) for row, step in enumerate(steps)])
-    zones = np.array([empty_zone(_kept_values(work, row)) for row in range(work.axes)])
+    centres, per_repeat = np.transpose(
+        [sticking_value(_kept_values(work, row), step) for row, step in enumerate(steps)]
+    )
+    zones = np.array(
+        [
+            empty_zone(_kept_values(work, row) - centre)
+            for row, centre in enumerate(np.nan_to_num(centres))
+        ]
+    )
     lowest, highest = _record_range(moments)
     at_ends = _count_at_range_ends(moments, counts[..., 3:5])
     # held samples; those at zero or at an end of the range have another cause
     repeats = counts[..., 2] - _count_at_range_ends(moments, counts[..., 5:7]).sum(axis=-1)
     # zeros of one axis alone, unless zero is the end of its range
     stuck = np.where((lowest < 0.0) & (highest > 0.0), counts[..., 1] - filled, 0)
+    sticks = np.isfinite(centres)[:, None]
+    stuck = np.where(sticks, np.rint(repeats * per_repeat[:, None]).astype(np.int64), stuck)
     line_total, line_square = np.moveaxis(work.line_counts, -1, 0)
     weight: Array = np.zeros(line_total.shape)
     np.divide(line_total**2, line_square, where=line_square > 0, out=weight)
@@ -88,6 +98,7 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         "line_weight": weight,
         "bin_width": widths[:, 0],
         "bin_width_stderr": widths[:, 1],
+        "zone_centre": centres,
         "zone_width": zones[:, 0],
         "zone_width_stderr": zones[:, 1],
     }

@@ -61,7 +61,9 @@ BLOCK_STATISTICS: dict[str, Variable] = {
     "range_end": Variable(("axis", "range"), _RATE, "smallest and largest value of the record"),
     "range_end_samples": Variable(("axis", "range"), "1", "samples of the record that equal it"),
     "zeros": Variable(_BLOCK, "1", "samples that are exactly 0"),
-    "stuck": Variable(_BLOCK, "1", "zeros of one axis, within its range"),
+    "stuck": Variable(
+        _BLOCK, "1", "zeros of one axis, within its range, or samples at `zone_centre`"
+    ),
     "filled": Variable(
         _BLOCK, "1", "simultaneous zeros of all axes; of a single axis, zeros in runs"
     ),
@@ -85,6 +87,9 @@ BLOCK_STATISTICS: dict[str, Variable] = {
         ("axis", "bin"), "1", "width of the zero bin and of its neighbours, in quantization steps"
     ),
     "bin_width_stderr": Variable(("axis", "bin"), "1", "standard error of it"),
+    "zone_centre": Variable(
+        ("axis",), _RATE, "value other than 0 at which the axis sticks, NaN for none"
+    ),
     "zone_width": Variable(
         ("axis",), _RATE, "half width of a zone around zero that is empty but near zero"
     ),

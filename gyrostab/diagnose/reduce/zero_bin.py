@@ -26,6 +26,8 @@ _OFF_GRID_SHARE = 0.01  # of the values, and of a step, that values may be off t
 _MAX_ITERATIONS = 50
 #: Levels in as much beyond an empty zone as it is wide; by chance 1 in 2^40 gaps leaves out 40.
 _MIN_BEYOND = 40
+_MIN_STICKING_RUNS = 5  # of equal samples at one value; design choice
+_MIN_SCATTER_STEPS = 2.0  # scatter of values on a grid, of which the most common has 28 % of runs
 
 
 def bin_widths(values: Array, step: float) -> tuple[Array, Array]:
@@ -109,6 +111,41 @@ def empty_zone(values: Array) -> tuple[float, float]:
     if beyond[gap] < _MIN_BEYOND:
         return np.nan, np.nan
     return float(outer[gap]), float((outer[gap] - inner[gap]) / beyond[gap])
+
+
+def sticking_value(values: Array, step: float) -> tuple[float, float]:
+    """Find the value other than 0 at which an axis sticks, and its samples per repeated sample.
+
+    Held samples repeat a different value each time; a loop sticks at one value, and most runs of
+    equal samples have it. On a quantization grid of many levels no value has most of the runs by
+    chance. Ends of the range are left out. NaN without such a value.
+
+    Examples
+    --------
+    >>> rate = np.random.default_rng(1).normal(0.0, 1.0, 20_000)
+    >>> sticking = np.where(np.abs(rate - 0.5) < 0.3, 0.5, rate)
+    >>> sticking_value(sticking, 0.0)[0], sticking_value(np.rint(10.0 * rate) / 10.0, 0.1)
+    (0.5, (nan, 1.0))
+    """
+    if not np.nanstd(values) > _MIN_SCATTER_STEPS * step:
+        return np.nan, 1.0
+    same = np.concatenate([[False], values[1:] == values[:-1]]) & (values != 0.0)
+    starts = np.flatnonzero(same[1:] & ~same[:-1])
+    levels, runs = np.unique(values[starts + 1], return_counts=True)
+    inside = (levels > np.nanmin(values)) & (levels < np.nanmax(values))
+    if not inside.any():
+        return np.nan, 1.0
+    most = int(np.argmax(np.where(inside, runs, 0)))
+    if runs[most] < max(_MIN_STICKING_RUNS, 0.5 * runs.sum()):
+        return np.nan, 1.0
+    return float(levels[most]), float((values == levels[most]).sum() / same.sum())
+
+
+def sticking_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
+    """Find the axes (axis,) that stick at a value other than 0; see `sticking_value`."""
+    if "zone_centre" not in blocks:
+        return np.zeros(blocks.sizes["axis"], np.bool_)
+    return np.asarray(np.isfinite(blocks["zone_centre"].values))
 
 
 def _parabola_columns(at: Array, reach: float) -> Array:

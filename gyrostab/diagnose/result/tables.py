@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.estimate.constant_rate import constant_rates, noise_lost_by_truncation
+from gyrostab.diagnose.estimate.constant_rate import constant_rates, undo_noise_loss
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.components import are_lines
 from gyrostab.diagnose.identify.identification import Identifications
@@ -24,9 +24,8 @@ from gyrostab.diagnose.result.text import effect_statement, span_text, unsized_s
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.noise import LAWS
-from gyrostab.physics.logger import FAST_INSTRUMENT_SAMPLES
+from gyrostab.physics.logger_filter import FAST_INSTRUMENT_SAMPLES
 from gyrostab.simulate.model import Model
-from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
 
@@ -200,10 +199,7 @@ def model_tables(
         fitted_effect.effect for fitted_effect in fitted if fitted_effect.effect is not None
     ]
     if baseline.attrs.get("source") == "calibrated":
-        rate = float(blocks.attrs["sampling_rate_hz"])
-        for axis, variance in noise_lost_by_truncation(blocks, added_effects).items():
-            square = max(noise[axis]["N"] ** 2 + variance / (HOUR * rate), 0.0)
-            noise[axis]["N"] = float(f"{math.sqrt(square):.6g}")
+        noise = undo_noise_loss(noise, blocks, added_effects)
     instrument = max(
         [
             int(own.log.get("oversampling", 1)) if own is not None else 1,

@@ -30,6 +30,7 @@ from gyrostab.diagnose.predict.condition import free_shape
 from gyrostab.diagnose.predict.linear_model import State, cross_without
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.reduce.label_statistics import MIN_MEAN_SHARE
+from gyrostab.diagnose.reduce.zero_bin import sticking_axes
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.base import NullDraw, Region, SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.null_counts import null_counts
@@ -139,13 +140,14 @@ class SampleCounts(Statistic):
             return []
         subsets = fold_subsets(trial.folds)
         rows = self.rows(group[0], trial.state)
+        sticks = sticking_axes(trial.state.blocks)  # repeats of one value are not held samples
         out = []
         for candidate in group:
             evidence_nats, best = [], []
             for variant in candidate.variants:
                 by_name = [
                     np.where(
-                        hidden_by_grid(trial.state.blocks, name),
+                        hidden_by_grid(trial.state.blocks, name) | (sticks & (name == "repeats")),
                         0.0,
                         _count_evidence(name, trial.data, trial.state, subsets, trial.counts),
                     )

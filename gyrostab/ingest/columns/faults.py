@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.plan_draft import Column
+from gyrostab.ingest.columns.plan import Column
 from gyrostab.store.lazy import read_slice
 
 if TYPE_CHECKING:

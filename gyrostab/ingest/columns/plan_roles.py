@@ -27,55 +27,52 @@ from gyrostab.ingest.columns.headers import (
     stored_name,
     unit_quantity,
 )
-from gyrostab.ingest.columns.plan_draft import MAX_HEADERS, Column, PlanDraft
+from gyrostab.ingest.columns.plan import MAX_HEADERS, Column, Plan
 from gyrostab.ingest.limits import limit_value
 from gyrostab.units import HOUR, INNER, known_units, parse_unit
 from gyrostab.wording import list_some
 
 
-def plan_gyro(
-    draft: PlanDraft, gyro: list[Header], columns: Sequence[FileColumn]
-) -> tuple[str | None, str | None]:
-    """Plan the gyro axes; return signal and kind (rates, increments or cumulative angles)."""
-    if draft.options.channels_only:
+def plan_gyro(plan: Plan, gyro: list[Header], columns: Sequence[FileColumn]) -> None:
+    """Plan the gyro axes, with signal and kind (rates, increments or cumulative angles)."""
+    if plan.options.channels_only:
         for column in gyro:
-            draft.leave_out(column)
-        draft.left_out.extend(c.header for c in gyro)
-        return None, None
+            plan.leave_out(column)
+        plan.left_out.extend(c.header for c in gyro)
+        return
     if not gyro:
-        if not draft.problems:
-            draft.refuse(FormatError, _describe_lack(draft.path, columns))
-        return None, None
+        if not plan.problems:
+            plan.refuse(FormatError, _describe_lack(plan.path, columns))
+        return
     quantities: dict[str, str] = {}
     for column in gyro:
-        quantity = _plan_axis(draft, column)
+        quantity = _plan_axis(plan, column)
         if quantity is not None:
             quantities[column.header] = quantity
     if len(set(quantities.values())) > 1:
         listed = ", ".join(f"{header!r} ({quantity})" for header, quantity in quantities.items())
-        draft.refuse(
+        plan.refuse(
             UnitError,
             f"the gyro axes are partly rates, partly angles: {listed}; keep one kind and drop the "
             "others with --map NAME=-",
         )
-    if not quantities:
-        return None, None
-    signal = next(iter(quantities.values()))
-    first = next(column for column in gyro if column.header in quantities)
-    return signal, _find_kind(draft, signal, first.header, first.key, first.low)
+    if quantities:
+        plan.signal = next(iter(quantities.values()))
+        first = next(column for column in gyro if column.header in quantities)
+        plan.kind = _find_kind(plan, first.header, first.key, first.low)
 
 
-def _plan_axis(draft: PlanDraft, column: Header) -> str | None:
+def _plan_axis(plan: Plan, column: Header) -> str | None:
     match = AXIS_PATTERN.match(column.low)
     assert match is not None
     stem, axis = match.groups()
     example, allowed = ("deg/s", ("rate", "angle")) if stem == "gyro" else ("deg", ("angle",))
     keys = [column.low, column.key, column.header, stem]
-    text = draft.find_unit(column, keys, column.unit, lambda written: is_unit_of(written, allowed))
+    text = plan.find_unit(column, keys, column.unit, lambda written: is_unit_of(written, allowed))
 
     def refuse(error: type[UnitError], problem: str, quantity: str | None = None) -> None:
-        draft.refuse(error, problem)
-        draft.add_summary(column, column.low, "gyro", quantity, text)
+        plan.refuse(error, problem)
+        plan.add_summary(column, column.low, "gyro", quantity, text)
 
     if text is None:
         refuse(
@@ -90,7 +87,7 @@ def _plan_axis(draft: PlanDraft, column: Header) -> str | None:
         unit = parse_unit(text, quantity)
     except UnitError as error:
         if "factor" in str(error):
-            draft.refuse(UnitError, f"column {column.header!r}: {error}")
+            plan.refuse(UnitError, f"column {column.header!r}: {error}")
             return None
         refuse(
             UnitError,
@@ -110,38 +107,38 @@ def _plan_axis(draft: PlanDraft, column: Header) -> str | None:
         )
         return None
     planned = column.source, column.header, "gyro", axis, unit.quantity, INNER[unit.quantity]
-    draft.add_column(column, text, Column(*planned, unit.factor, unit.offset))
+    plan.add_column(column, text, Column(*planned, unit.factor, unit.offset))
     return unit.quantity
 
 
-def _find_kind(draft: PlanDraft, signal: str, header: str, key: str, name: str) -> str | None:
-    if signal == "rate":
-        if draft.options.kind == "angle":
-            draft.refuse(
+def _find_kind(plan: Plan, header: str, key: str, name: str) -> str:
+    if plan.signal == "rate":
+        if plan.options.kind == "angle":
+            plan.refuse(
                 OptionError,
                 f"--kind angle, but column {header!r} is a rate; leave --kind out, or correct the "
                 f'unit with --map "{key}={name} [deg]"',
             )
         return "rate"
-    if draft.options.kind is None:
-        draft.refuse(
+    if plan.options.kind is None:
+        plan.refuse(
             OptionError,
             f"column {header!r} is an angle of unknown kind; give --kind angle if it is the "
             "cumulative angle, --kind rate if each row is the increment since the row before",
         )
-    if draft.options.kind == "angle" and name.startswith("gyro") and INCREMENT_PATTERN.search(key):
-        draft.refuse(
+    if plan.options.kind == "angle" and name.startswith("gyro") and INCREMENT_PATTERN.search(key):
+        plan.refuse(
             OptionError,
             f"--kind angle, but column {header!r} is named as an increment; give --kind rate if "
             "each row is an increment, or if it is the cumulative angle, name it so with "
             f'--map "{key}=angle_{name.removeprefix("gyro_")}"',
         )
-    return "angle" if draft.options.kind == "angle" else "increment"
+    return "angle" if plan.options.kind == "angle" else "increment"
 
 
-def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
+def plan_channels(plan: Plan, rest: list[Header]) -> None:
     """Plan the channels: those with a unit are kept, others left out with a note or refused."""
-    _note_temperatures(draft, rest)
+    _note_temperatures(plan, rest)
     for column in rest:
         quantity = quantity_of(column.low)
         likely = quantity or ("temperature" if TEMPERATURE_PATTERN.search(column.low) else None)
@@ -155,16 +152,16 @@ def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
             *([column.low.split("_")[0]] if quantity else []),
         ]
         usable = partial(is_unit_of, quantities=(unit_quantity(quantity),)) if quantity else is_unit
-        text = draft.find_unit(column, keys, column.unit, usable)
+        text = plan.find_unit(column, keys, column.unit, usable)
         if column.low == "ramp" and text is None:
             text = "1"  # any scale will do
         asked = (
             column.mapped
-            or draft.unit_key(keys) is not None
-            or (is_known and draft.options.channels_only)
+            or plan.unit_key(keys) is not None
+            or (is_known and plan.options.channels_only)
         )
         if text is None and asked:
-            draft.refuse(
+            plan.refuse(
                 MissingUnitError,
                 f"column {column.header!r} carries no unit; give it with --unit "
                 f'{name}={example_unit(likely)}, or drop the column with --map "{column.key}=-"',
@@ -172,40 +169,40 @@ def plan_channels(draft: PlanDraft, rest: list[Header]) -> None:
         if (
             text is not None
             and not (is_known or asked)
-            and draft.kept_channels >= limit_value("channels", draft.options.limits)
+            and plan.kept_channels >= limit_value("channels", plan.options.limits)
         ):
-            draft.surplus.append(column.header)
-            draft.leave_out(column)
+            plan.surplus.append(column.header)
+            plan.leave_out(column)
             continue
         if text is None:
-            draft.unitless.append((name, likely, column.header))
-            draft.leave_out(column)
+            plan.unitless.append((name, likely, column.header))
+            plan.leave_out(column)
             continue
-        _plan_channel(draft, column, name, quantity, text, is_known=is_known, asked=asked)
+        _plan_channel(plan, column, name, quantity, text, is_known=is_known, asked=asked)
 
 
-def _note_temperatures(draft: PlanDraft, rest: list[Header]) -> None:
+def _note_temperatures(plan: Plan, rest: list[Header]) -> None:
     """Note which columns could be the temperature of the gyro, unless one is named so."""
-    options = draft.options
+    options = plan.options
     is_named = any(quantity_of(column.low) == "temperature" for column in rest)
     if is_named or options.channels_only or options.channel:  # a file of channels may hold it
         return
     temperatures = []
     for column in rest:
-        key = draft.unit_key((column.low, column.key, column.header))
+        key = plan.unit_key((column.low, column.key, column.header))
         unit = column.unit or column.stored or (options.unit[key] if key else "")
         if is_unit_of(unit, ("temperature",)):
             temperatures.append(column)
     if temperatures and not any(column.mapped for column in temperatures):
         headers = list_some([column.header for column in temperatures], MAX_HEADERS)
-        draft.notes.append(
+        plan.notes.append(
             f"in units of temperature: {headers}; name the temperature of the gyro: --map "
             f'"{temperatures[0].key}=temperature"'
         )
 
 
 def _plan_channel(
-    draft: PlanDraft,
+    plan: Plan,
     column: Header,
     name: str,
     quantity: str | None,
@@ -230,22 +227,22 @@ def _plan_channel(
                 f"{name}={example_unit(quantity)}"
             )
             if not asked:
-                draft.notes.append(f"{message}, so it is left out; {advice}")
-                draft.leave_out(column)
+                plan.notes.append(f"{message}, so it is left out; {advice}")
+                plan.leave_out(column)
                 return
             fix = f'{advice}, or drop the column with --map "{column.key}=-"'
-            draft.refuse(UnitError, f"{message}; {fix}")
+            plan.refuse(UnitError, f"{message}; {fix}")
         else:
             quantity = None
     stored = stored_name(name)
     if stored != name:
-        draft.notes.append(
+        plan.notes.append(
             f"column {column.header!r} is kept as {stored!r}, as {name!r} is a variable of "
             f'gyrostab; for another name give --map "{column.key}=NAME"'
         )
-    draft.kept_channels += 1
+    plan.kept_channels += 1
     planned = column.source, column.header, "channel", stored, quantity or "other", units
-    draft.add_column(column, text, Column(*planned, factor, offset))
+    plan.add_column(column, text, Column(*planned, factor, offset))
 
 
 def _describe_lack(path: Path, columns: Sequence[FileColumn]) -> str:

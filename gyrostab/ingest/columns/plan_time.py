@@ -18,11 +18,11 @@ from gyrostab.ingest.columns.headers import (
     is_time_unit,
     split_header,
 )
-from gyrostab.ingest.columns.plan_draft import Column, PlanDraft
+from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_unit
 
 
-def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
+def find_time(plan: Plan, named: list[Header]) -> Header | None:
     """Choose the time column and its unit; other candidates are left out with a note."""
     time_columns = [c for c in named if c.low == "time" and c.mapped] or [
         c for c in named if c.low == "time" and c.preset
@@ -40,52 +40,52 @@ def find_time(draft: PlanDraft, named: list[Header]) -> Header | None:
             c
             for c in named
             if c.file.stamped
-            and draft.rising(c.source)
+            and plan.rises(c)
             and not (c.mapped or c.preset)
-            and not (c.file.date_order == NO_DATE and draft.options.rate is not None)
+            and not (c.file.date_order == NO_DATE and plan.options.rate is not None)
         ]
         reason = "it holds dates"
         if not time_columns:
-            clocks = [c for c in named if _is_clock(draft, c)]
+            clocks = [c for c in named if _is_clock(plan, c)]
             time_columns = clocks if len(clocks) == 1 else []
             reason = "it is the only column that rises in a unit of time"
         if time_columns:
             header = time_columns[0].header
-            draft.notes.append(f"{header!r} is taken for the time column, as {reason}")
+            plan.notes.append(f"{header!r} is taken for the time column, as {reason}")
     if not time_columns:
         return None
-    column, *rivals = sorted(time_columns, key=lambda c: not draft.rising(c.source))
+    column, *rivals = sorted(time_columns, key=lambda c: not plan.rises(c))
     rivals += [c for c in named if c.low == "time" and c not in time_columns]
     if rivals:
         names = " and ".join(repr(c.header) for c in [column, *rivals][:3])
-        draft.notes.append(
+        plan.notes.append(
             f"{names} look like the time; {column.header!r} is used (for another: --map "
             f'"{rivals[0].key}=time")'
         )
         for rival in rivals:
-            draft.leave_out(rival)
+            plan.leave_out(rival)
         named[:] = [c for c in named if c not in rivals]
-    unit = None if column.file.stamped else _time_unit(draft, column)
-    order = _date_order(draft, column) if column.file.stamped else YEAR_FIRST
+    unit = None if column.file.stamped else _time_unit(plan, column)
+    order = _date_order(plan, column) if column.file.stamped else YEAR_FIRST
     planned = column.source, column.header, "time", "time", "time", "ns"
-    draft.columns.append(
-        Column(*planned, time_unit=unit, date_order=order, epoch=draft.options.epoch_ns)
+    plan.columns.append(
+        Column(*planned, time_unit=unit, date_order=order, epoch=plan.options.epoch_ns)
     )
     written = unit.text if unit else None
     if column.file.stamped:
         written = "ISO 8601" if order == YEAR_FIRST else order
-    draft.add_summary(column, "time", "time", "time", written)
+    plan.add_summary(column, "time", "time", "time", written)
     if (
         unit is not None
         and unit.epoch is None
-        and draft.options.epoch is None
-        and not draft.options.channels_only
+        and plan.options.epoch is None
+        and not plan.options.channels_only
     ):
-        draft.notes.append(
+        plan.notes.append(
             "numeric time is counted from 1970-01-01T00:00:00 UTC; give --epoch for another zero"
         )
-    if unit is not None and unit.epoch is not None and draft.options.epoch is not None:
-        draft.notes.append(
+    if unit is not None and unit.epoch is not None and plan.options.epoch is not None:
+        plan.notes.append(
             f"--epoch is not used: the time column {column.header!r} is in {unit.text!r}"
         )
     return column
@@ -97,7 +97,7 @@ def _may_be_time(column: Header) -> bool:
     return written is None or column.file.stamped or names_epoch(written) or is_time_unit(written)
 
 
-def _is_clock(draft: PlanDraft, column: Header) -> bool:
+def _is_clock(plan: Plan, column: Header) -> bool:
     """Return whether a column of another name has a unit of time, and values known to rise."""
     unit = column.unit or column.stored
     return (
@@ -105,27 +105,27 @@ def _is_clock(draft: PlanDraft, column: Header) -> bool:
         and (is_time_unit(unit) or names_epoch(unit))
         and not (column.mapped or column.preset)
         and not KNOWN_CHANNEL_PATTERN.match(column.low)
-        and draft.knows_rising
-        and draft.rising(column.source)
+        and plan.rising is not None
+        and plan.rises(column)
     )
 
 
-def _date_order(draft: PlanDraft, column: Header) -> str:
+def _date_order(plan: Plan, column: Header) -> str:
     """Return the order of day, month and year: from the user, the header, or the dates."""
     names = [column.name, column.key, column.header, "time"]
-    for key in filter(None, (draft.unit_key([name]) for name in names)):
-        if order := parse_order(draft.options.unit[key]):
-            draft.used_units.add(key)
+    for key in filter(None, (plan.unit_key([name]) for name in names)):
+        if order := parse_order(plan.options.unit[key]):
+            plan.used_units.add(key)
             return order
     order = parse_order(column.unit or column.stored or "") or column.file.date_order
     if order == NO_DATE:
-        draft.refuse(
+        plan.refuse(
             UnitError,
             f"the time column {column.header!r} holds times of day without a date; write the date "
             "before the time, in this column or in one to its left",
         )
     if order is None:
-        draft.refuse(
+        plan.refuse(
             UnitError,
             f"the dates in the time column {column.header!r} can be read in two ways; say which "
             f"number is the day: --unit time={DAY_FIRST} or --unit time={MONTH_FIRST}",
@@ -133,17 +133,17 @@ def _date_order(draft: PlanDraft, column: Header) -> str:
     return order or EITHER_FIRST
 
 
-def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
+def _time_unit(plan: Plan, column: Header) -> TimeUnit | None:
     suffix = TIME_PATTERN.match(split_header(column.header)[0].lower())
     named = next((text for text in suffix.groups() if text), None) if suffix else None
     written = column.unit or (
         named if named not in ("utc", "iso") and column.stored is None else None
     )
     keys = [column.name, column.key, column.header, "time"]
-    text = draft.find_unit(column, keys, written, is_time_unit, prefer_given=column.unit is None)
+    text = plan.find_unit(column, keys, written, is_time_unit, prefer_given=column.unit is None)
     if text is None:
-        word = draft.word_in(column.source)
-        draft.refuse(
+        word = plan.word_in(column.source)
+        plan.refuse(
             MissingUnitError,
             f"the time column {column.header!r} holds {word!r}, which is neither a number nor a "
             "date in a form that is read; write the year with four digits and a zone as an offset, "
@@ -158,7 +158,7 @@ def _time_unit(draft: PlanDraft, column: Header) -> TimeUnit | None:
         return parse_time_unit(text, column.file.calendar if text == column.stored else None)
     except GyrostabError as error:
         advice = '"time=seconds since 2026-01-02T00:00:00"' if names_epoch(text) else "time=s"
-        draft.refuse(
+        plan.refuse(
             UnitError, f"column {column.header!r}: {error}; or give it with --unit {advice}"
         )
         return None

@@ -10,23 +10,22 @@ the sampling rate [Hz] above the header.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 from gyrostab.store.toml import load_toml_folder
 
 _KEYS = {"name", "above", "file", "needs", "times", "drops", "rate", "columns"}
 
 
-@dataclass(frozen=True)
-class PresetMatch:
+class PresetMatch(NamedTuple):
     """A preset that fits a file: column number -> target of ``--map``; rate [Hz] if known."""
 
-    name: str
-    columns: dict[int, str] = field(default_factory=dict)
+    name: str = ""
+    columns: Mapping[int, str] = MappingProxyType({})
     rate: float | None = None
 
 
@@ -43,8 +42,8 @@ def find_preset(
     path: Path,
     headers: Sequence[tuple[str, str]],
     *,
-    above: Sequence[str] = (),
-    is_filled: Callable[[int], bool] | None = None,
+    above: Sequence[str],
+    is_filled: Callable[[int], bool],
 ) -> PresetMatch:
     """Find the preset that fits a file, with an empty name for the files of other programs.
 
@@ -55,52 +54,25 @@ def find_preset(
     for place, names in reversed(list(enumerate(headers))):
         for name in reversed(names):
             places[name.strip().lower()] = place
+
+    def held(names: Sequence[str]) -> list[int]:
+        return [places[name.lower()] for name in names if name.lower() in places]
+
     for key, preset in _load_presets().items():
         gyro = [names for target, names in preset["columns"].items() if target.startswith("gyro_")]
-        if not all(
-            any(name.lower() in places for name in names)
-            for names in [*gyro, *([name] for name in preset.get("needs", ()))]
+        if (
+            not all(map(held, [*gyro, *([name] for name in preset.get("needs", ()))]))
+            or ("file" in preset and not re.search(preset["file"], path.name, re.IGNORECASE))
+            or ("above" in preset and not any(re.search(preset["above"], line) for line in above))
         ):
             continue
-        if "file" in preset and not re.search(preset["file"], path.name, re.IGNORECASE):
-            continue
-        if "above" in preset and not any(re.search(preset["above"], line) for line in above):
-            continue
-        return _apply_preset(
-            f"{preset['name']} (preset {key})",
-            preset,
-            places,
-            above,
-            is_filled or (lambda place: True),
-        )
-    return PresetMatch("")
-
-
-def _apply_preset(
-    name: str,
-    preset: dict[str, Any],
-    places: dict[str, int],
-    above: Sequence[str],
-    is_filled: Callable[[int], bool],
-) -> PresetMatch:
-    columns = {
-        places[drop.lower()]: "-" for drop in preset.get("drops", ()) if drop.lower() in places
-    }
-    times = [
-        (places[time["column"].lower()], time["unit"])
-        for time in preset["times"]
-        if time["column"].lower() in places
-    ]
-    filled = [(place, unit) for place, unit in times if is_filled(place)]
-    columns.update(dict.fromkeys([place for place, _ in times], "-"))
-    if filled:
-        columns[filled[0][0]] = f"time [{filled[0][1]}]"
-    for target, names in preset["columns"].items():
-        held = [places[name.lower()] for name in names if name.lower() in places]
-        columns.update(dict.fromkeys(held[:1], target))
-    rates = [
-        match[1]
-        for line in above
-        if "rate" in preset and (match := re.search(preset["rate"], line))
-    ]
-    return PresetMatch(name, columns, float(rates[0]) if rates else None)
+        columns = dict.fromkeys(held(preset.get("drops", ())), "-")
+        times = {at: time["unit"] for time in preset["times"] for at in held([time["column"]])}
+        columns |= dict.fromkeys(times, "-")
+        columns |= {at: f"time [{times[at]}]" for at in list(filter(is_filled, times))[:1]}
+        for target, names in preset["columns"].items():
+            columns |= dict.fromkeys(held(names)[:1], target)
+        matches = (re.search(preset["rate"], line) for line in above if "rate" in preset)
+        rates = [float(match[1]) for match in matches if match]
+        return PresetMatch(f"{preset['name']} (preset {key})", columns, next(iter(rates), None))
+    return PresetMatch()

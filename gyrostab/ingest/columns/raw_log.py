@@ -14,8 +14,7 @@ from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.clock import TurningClock
 from gyrostab.ingest.columns.faults import Faults, Locate, Quote, describe_codes
 from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Buffers, find_even
-from gyrostab.ingest.columns.plan import Plan
-from gyrostab.ingest.columns.plan_draft import Column
+from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.stamps import NAT
 from gyrostab.ingest.options import FileSummary
 from gyrostab.schema import SIGNAL_UNITS
@@ -157,7 +156,7 @@ class RawLogBuilder:
             notes=[f"{name}: {note}" for note in notes],
             unreadable_rows=self.faults.rows.total,
             unreadable_cells=self.faults.cells,
-            unmatched_options=list(self.plan.unmatched),
+            unmatched_options=self.plan.unmatched,
             headers=[summary.header for summary in self.plan.summaries],
         )
         return dataset
@@ -251,7 +250,7 @@ def summary_of(
     return FileSummary(
         path=plan.path,
         format=form,
-        columns=plan.summaries,
+        columns=tuple(plan.summaries),
         axes=tuple(column.name for column in plan.of("gyro")),
         channels=tuple(column.name for column in plan.of("channel")),
         first=first,

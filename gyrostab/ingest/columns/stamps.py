@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import UnitError
 from gyrostab.ingest.columns.dates import YEAR_FIRST, as_iso
 from gyrostab.store.lazy import read_slice
-from gyrostab.time.grid import split_instant
-from gyrostab.time.stamps import to_nanoseconds
+from gyrostab.time.stamps import split_instant, to_nanoseconds
 
 #: The integer of ``NaT``.
 NAT = np.iinfo(np.int64).min

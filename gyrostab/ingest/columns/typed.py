@@ -10,8 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.dates import is_iso
-from gyrostab.ingest.columns.plan import Plan
-from gyrostab.ingest.columns.plan_draft import Column
+from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, numbers_to_ns
 from gyrostab.ingest.options import FileSummary

@@ -7,16 +7,17 @@ A curve ``TIME``, or an index of dates and times, is the time; if the file also 
 from __future__ import annotations
 
 import re
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.dates import as_iso, find_order
 from gyrostab.ingest.columns.headers import is_time_unit
-from gyrostab.ingest.columns.stamps import floats_to_ns, parse_time_unit
+from gyrostab.ingest.columns.stamps import NAT, floats_to_ns, parse_time_unit, texts_to_ns
 from gyrostab.ingest.columns.typed import holds_dates
 from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
@@ -25,15 +26,6 @@ from gyrostab.time.stamps import to_nanoseconds
 
 # Date fields in units of curves -> codes of `datetime.strptime`.
 _DATE_CODES = {"yyyy": "%Y", "yy": "%y", "mmm": "%b", "mm": "%m", "dd": "%d"}
-_CLEAR_FORMATS = (
-    *("%Y-%m-%d", "%Y%m%d", "%Y/%m/%d"),
-    *("%d-%b-%y", "%d-%b-%Y", "%d/%b/%y", "%d/%b/%Y", "%d %b %Y"),
-)
-#: Several of these may fit a date.
-_UNCLEAR_FORMATS = (
-    *("%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y", "%m-%d-%Y"),
-    *("%d/%m/%y", "%m/%d/%y", "%y/%m/%d"),
-)
 #: A cell with a date and a time of day, such as ``14-Mar-26/08:00:00.5``.
 _DATE_AND_TIME = re.compile(r"^(\S+?)[T_/:;-](\d{1,2}:\d\d:\d\d(?:\.\d+)?)Z?$")
 
@@ -94,18 +86,13 @@ def _to_stamps(
     path: Path, name: str, days: list[str], date_unit: str, times: Any, time_unit: str = ""
 ) -> NDArray[np.datetime64]:
     """Combine dates and times of day to stamps."""
-    import pandas as pd
-
-    order = _date_order(date_unit, days[:1000])
-    if order is None:
+    start = _parse_days(days, date_unit)
+    if start is None:
         fix = f"write the dates as 2026-03-14, or drop the curve with --map {name}=-"
         raise FormatError(
             f"{path.name}: the order of day and month in the curve {name} ({days[0]!r}) is not "
             f"clear; {fix}"
         )
-    start = to_nanoseconds(
-        pd.to_datetime(pd.Series(days), format=order, errors="coerce").to_numpy(), far_as_nat=True
-    ).view("datetime64[ns]")
     clock = pd.Series(times)
     if clock.dtype.kind not in "iuf":
         since = pd.to_timedelta(clock.astype(str).str.strip(), errors="coerce").to_numpy(
@@ -118,31 +105,21 @@ def _to_stamps(
             numbers = numbers // 10000 * 3600 + numbers // 100 % 100 * 60 + numbers % 100
         unit = parse_time_unit(time_unit if is_time_unit(time_unit) else "s")
         since = floats_to_ns(numbers, unit, 0).view("timedelta64[ns]")
-    return np.asarray(start + since)
+    return np.asarray(start.view("datetime64[ns]") + since)
 
 
-def _date_order(unit: str, days: list[str]) -> str | None:
-    """Return the date format: that of the curve's unit, or the only one that fits."""
-    unit_format = (
-        re.sub(r"(?i)y{4}|y{2}|m{3}|m{2}|d{2}", lambda part: _DATE_CODES[part[0].lower()], unit)
-        if re.search(r"(?i)yy", unit)
-        else ""
-    )
-    for order in (unit_format, *_CLEAR_FORMATS):
-        if order and _has_date_format(order, days):
-            return order
-    fitting = [order for order in _UNCLEAR_FORMATS if _has_date_format(order, days)]
-    return fitting[0] if len(fitting) == 1 else None
-
-
-def _has_date_format(order: str, days: list[str]) -> bool:
-    filled = [day for day in days if day and day.lower() != "nan"]
-    try:
-        for day in filled:
-            datetime.strptime(day, order)
-    except ValueError:
-        return False
-    return bool(filled)
+def _parse_days(days: list[str], unit: str) -> NDArray[np.int64] | None:
+    """Return the beginnings of days [ns since 1970], by the unit of the curve or by their form."""
+    if re.search(r"(?i)yy", unit):
+        code = re.sub(
+            r"(?i)y{4}|y{2}|m{3}|m{2}|d{2}", lambda part: _DATE_CODES[part[0].lower()], unit
+        )
+        dates = pd.to_datetime(pd.Series(days), format=code, errors="coerce").to_numpy()
+        if not np.isnat(dates).all():
+            return to_nanoseconds(dates, far_as_nat=True)
+    order = find_order(days[:1000])
+    stamps = texts_to_ns([as_iso(day, order or "") or day for day in days])
+    return None if order is None or (stamps == NAT).all() else stamps
 
 
 scan, read = make_reader("las", _read_curves)

@@ -27,7 +27,7 @@ from gyrostab.ingest.columns.headers import (
     TIME_PATTERN,
     is_time_unit,
 )
-from gyrostab.ingest.formats.matlab5 import check_structure
+from gyrostab.ingest.formats.matlab5 import read_arrays
 from gyrostab.ingest.formats.packing import ATTRIBUTES
 from gyrostab.ingest.formats.tables import (
     StoredArray,
@@ -155,46 +155,7 @@ def _find_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[t
     if b"MATLAB 7.3" in head[:128] or b"\x89HDF" in head or path.suffix.lower() in HDF_SUFFIXES:
         yield from _find_hdf_arrays(path, stack, objects)
         return
-    from scipy.io import loadmat
-
-    check_structure(path)
-    content = loadmat(path, simplify_cells=False, struct_as_record=True, chars_as_strings=True)
-    for name, value in content.items():
-        if not name.startswith("__"):
-            yield from _flatten_struct(name, value, objects)
-
-
-def _flatten_struct(name: str, value: Any, objects: list[str]) -> Iterator[tuple[str, Any]]:
-    from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque
-
-    if isinstance(value, MatlabFunction):
-        return
-    fields = value.dtype.names if isinstance(value, np.ndarray) else None
-    if isinstance(value, MatlabOpaque):
-        objects.append(_describe_opaque(name, value))
-    elif isinstance(value, MatlabObject):
-        objects.append(f"an object of class {value.classname!r}")
-    elif fields and value.size == 1:
-        for field in fields:
-            yield from _flatten_struct(f"{name}.{field}", value.reshape(-1)[0][field], objects)
-    elif fields and value.size > 1:  # table2struct: one structure a row
-        for field in fields:
-            cells = [np.asarray(cell) for cell in value[field].reshape(-1)]
-            if all(cell.size == 1 and cell.dtype.kind in "biuf" for cell in cells):
-                yield f"{name}.{field}", np.array([cell.item() for cell in cells])
-    elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-        yield name, value
-
-
-def _describe_opaque(name: str, value: NDArray[Any]) -> str:
-    """Return class and name of an object of a class that scipy does not read."""
-    fields = value.dtype.names or () if value.size else ()
-    entry = value.reshape(-1)[0] if value.size else None
-    if entry is not None and "_Class" in fields:  # scipy 1.18
-        return f"a {_to_text(entry['_Class'])} {name!r}"
-    kind = _to_text(entry["s2"]) if entry is not None and "s2" in fields else "object"
-    label = f" {_to_text(entry['s0'])!r}" if entry is not None and "s0" in fields else ""
-    return f"a {kind}{label}"
+    yield from read_arrays(path, objects)
 
 
 def _to_text(value: Any) -> str:

@@ -11,8 +11,8 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError
@@ -20,10 +20,7 @@ from gyrostab.ingest.columns.headers import AXIS_PATTERN, split_header
 from gyrostab.ingest.columns.stamps import names_epoch
 from gyrostab.ingest.combine import with_channels
 from gyrostab.ingest.formats.netcdf_logs import open_log, summarise_log
-from gyrostab.ingest.formats.netcdf_variables import (
-    StoredVariable,
-    open_variables,
-)
+from gyrostab.ingest.formats.netcdf_variables import find_variables, open_undecoded
 from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.formats.tables import (
     StoredArray,
@@ -55,9 +52,9 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     if log is not None:
         with log:
             return summarise_log(path, log)
-    with open_variables(path, options.limits) as variables:
+    with open_undecoded(path) as stored:
         form = "zarr" if path.is_dir() else "netcdf"
-        main, slower, notes = _find_tables(path, variables, options)
+        main, slower, notes = _find_tables(path, stored, options)
         summary = scan_tables(path, form, [main], options, notes)
         others = (scan_tables(path, form, [table], _for_channels(options)) for table in slower)
         names = [name for other in others for name in other.channels]
@@ -69,8 +66,8 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
     log = open_log(path, options)
     if log is not None:
         return log
-    with open_variables(path, options.limits) as variables:
-        main, slower, notes = _find_tables(path, variables, options)
+    with open_undecoded(path) as stored:
+        main, slower, notes = _find_tables(path, stored, options)
         log = read_tables(path, [main], options, notes=notes)
         for table in slower:
             log = _add_channels(log, read_tables(path, [table], _for_channels(options)))
@@ -82,38 +79,40 @@ def _for_channels(options: ReadOptions) -> ReadOptions:
 
 
 def _find_tables(
-    path: Path, variables: Mapping[str, StoredVariable], options: ReadOptions
+    path: Path, stored: xr.Dataset, options: ReadOptions
 ) -> tuple[Table, list[Table], list[str]]:
     """Return a table of the main dimension, those of others that have stamps, and notes.
 
     The main dimension is the longest of those with gyro axes, otherwise the longest.
     """
-    numeric = [v for v in variables.values() if v.dtype.kind in "iuf" and len(v.shape) in (1, 2)]
-    sizes = {dim: size for v in numeric for dim, size in zip(v.dimensions, v.shape, strict=True)}
-    lines = Counter(max(v.dimensions, key=lambda d: sizes[d]) for v in numeric)
+    variables, sizes = find_variables(path, stored, options.limits), stored.sizes
+    numeric = {n: v for n, v in variables.items() if v.dtype.kind in "iuf" and v.ndim in (1, 2)}
+    lines = Counter(max(v.dims, key=lambda d: sizes[d]) for v in numeric.values())
     if not lines:
         raise FormatError(
             f"{path.name}: there is no numeric variable on a dimension; groups are not searched, "
             "so store variables at the top level"
         )
     with_axes = {
-        max(v.dimensions, key=lambda d: sizes[d]) for v in numeric if _holds_axes(v, options)
+        max(v.dims, key=lambda d: sizes[d])
+        for name, v in numeric.items()
+        if _holds_axes(name, v, options)
     }
     main_dim = max(lines, key=lambda d: (d in with_axes, sizes[d], lines[d]))
     stamped = {
-        v.dimensions[0]: v
-        for v in numeric
-        if len(v.shape) == 1 and names_epoch(str(v.attributes.get("units", "")))
+        v.dims[0]: name
+        for name, v in numeric.items()
+        if v.ndim == 1 and names_epoch(str(v.attrs.get("units", "")))
     }
-    columns: dict[str, list[TableColumn]] = {dim: [] for dim in (main_dim, *stamped)}
+    columns: dict[Any, list[TableColumn]] = {dim: [] for dim in (main_dim, *stamped)}
     left_out: list[str] = []
-    for variable in numeric:
-        dim = next((dim for dim in columns if dim in variable.dimensions), main_dim)
-        variable_columns = _columns_of(variables, variable, dim)
-        if dim != main_dim and variable is stamped[dim]:
+    for name, variable in numeric.items():
+        dim = next((dim for dim in columns if dim in variable.dims), main_dim)
+        variable_columns = _columns_of(variables, name, dim)
+        if dim != main_dim and name == stamped[dim]:
             variable_columns = [replace(variable_columns[0], name=("time",))]
         columns[dim] += variable_columns
-        left_out += [] if variable_columns else [variable.name]
+        left_out += [] if variable_columns else [name]
     notes = (
         [f"left out, as they do not run along {main_dim!r} alone: {', '.join(left_out[:20])}"]
         if left_out
@@ -136,33 +135,32 @@ def _add_channels(log: xr.Dataset, part: xr.Dataset) -> xr.Dataset:
     return with_channels(log, [part]) if part.data_vars else log
 
 
-def _holds_axes(variable: StoredVariable, options: ReadOptions) -> bool:
+def _holds_axes(name: str, variable: xr.Variable, options: ReadOptions) -> bool:
     """Return whether the name of a variable, or ``--map``, makes it one or several gyro axes."""
-    stored = variable.name.lower()
+    stored = name.lower()
     mapped = [
         target for key, target in options.map.items() if key.lower().partition("/")[0] == stored
     ]
     names = (split_header(text)[0].lower() for text in mapped or [stored])
-    return (len(variable.shape) == 2 and stored in _SIGNALS) or any(map(AXIS_PATTERN.match, names))
+    return (variable.ndim == 2 and stored in _SIGNALS) or any(map(AXIS_PATTERN.match, names))
 
 
-def _columns_of(
-    variables: Mapping[str, StoredVariable], variable: StoredVariable, dim: str
-) -> list[TableColumn]:
-    if variable.dimensions == (dim,):
-        return StoredArray(variable.values, 0).make_columns([variable.name], variable.attributes)
-    if dim not in variable.dimensions or len(variable.shape) != 2:
+def _columns_of(variables: Mapping[str, xr.Variable], name: str, dim: Any) -> list[TableColumn]:
+    variable = variables[name]
+    if variable.dims == (dim,):
+        return StoredArray(variable, 0).make_columns([name], variable.attrs)
+    if dim not in variable.dims or variable.ndim != 2:
         return []
-    along = variable.dimensions.index(dim)
-    other_dim, size = variable.dimensions[1 - along], variable.shape[1 - along]
+    along = variable.dims.index(dim)
+    other_dim, size = str(variable.dims[1 - along]), variable.shape[1 - along]
     if size > MAX_COLUMNS:
         return []
     labels = [str(place) for place in range(size)]
     if other_dim in variables and variables[other_dim].shape == (size,):
         labels = [
             label.decode(errors="replace") if isinstance(label, bytes) else str(label)
-            for label in np.ma.getdata(variables[other_dim].values[:])
+            for label in variables[other_dim].values
         ]
-    stem = "gyro_" if variable.name.lower() in _SIGNALS else f"{variable.name}/"
+    stem = "gyro_" if name.lower() in _SIGNALS else f"{name}/"
     names = [f"{stem}{label}" for label in labels]
-    return StoredArray(variable.values, along).make_columns(names, variable.attributes)
+    return StoredArray(variable, along).make_columns(names, variable.attrs)

@@ -2,39 +2,32 @@
 
 from __future__ import annotations
 
-import sys
+import io
+import os
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, SchemaError, TimeError
-from gyrostab.ingest.columns.stamps import names_epoch
 from gyrostab.ingest.concat.grid import log_span
-from gyrostab.ingest.formats.netcdf_classic import check_classic_header
-from gyrostab.ingest.formats.netcdf_variables import with_default_fill
-from gyrostab.ingest.formats.packing import decode_variables
-from gyrostab.ingest.limits import check_declared, check_stored
+from gyrostab.ingest.formats.netcdf_variables import open_undecoded
+from gyrostab.ingest.limits import check_declared
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
-from gyrostab.store.attributes import decode_attributes, read_attribute
+from gyrostab.store.attributes import read_attribute
 from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.cf import from_disk
 from gyrostab.store.hdf5_heaps import check_global_heaps
 from gyrostab.store.read import open_stored
 from gyrostab.store.remote import find_url
+from gyrostab.store.times import decode_stamps
 
-#: Options to open a file with xarray; numbers and stamps are decoded when they are read.
-_UNDECODED: dict[str, Any] = {
-    "chunks": None,
-    "mask_and_scale": False,
-    "decode_times": False,
-    "create_default_indexes": False,
-}
+_CALENDARS = ("standard", "gregorian", "proleptic_gregorian")
+_VALID_RANGES = {"valid_range", "valid_min", "valid_max"}
 _OTHER_CONTENT = {"surface": "a dynamic Allan variance", "product": "a product"}
 
 
@@ -43,30 +36,40 @@ def open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     if url := find_url(path):
         return _open_remote(path, url)
     if path.is_file():
-        check_classic_header(path)  # before the library allocates what a damaged header asks for
+        _check_classic_header(path)
     content = read_attribute(path, "gyrostab_content")
-    if content == "log":
-        check = partial(check_declared, given=options.limits)
-        return _open_own(path, open_stored(path, strict=options.strict, check=check))
-    if path.is_file():
-        check_global_heaps(path)
-    if content in _OTHER_CONTENT and not options.channels_only:
-        raise FormatError(
-            f"{path.name}: is {_OTHER_CONTENT[content]} that gyrostab wrote, not a log; give the "
-            "log that it was made from"
-        )
-    if path.is_dir():
-        check_blosc_chunks(path)
-    regular = _open_regular(path)
-    if regular is None:
-        return None
-    log = _as_in_memory(path, decode_variables(path, regular))  # an index would load every stamp
-    log.set_close(regular.close)
-    check_stored(path, log.sizes.get("time", 0), log.sizes.get("axis", 1), options.limits)
+    if content != "log":
+        if path.is_file():
+            check_global_heaps(path)
+        if content in _OTHER_CONTENT and not options.channels_only:
+            raise FormatError(
+                f"{path.name}: is {_OTHER_CONTENT[content]} that gyrostab wrote, not a log; give "
+                "the log that it was made from"
+            )
+        if path.is_dir():
+            check_blosc_chunks(path)
+        if not _is_regular(path):
+            return None
+    check = partial(check_declared, given=options.limits)
+    stored = open_stored(path, strict=options.strict, check=check)
+    if path.is_dir() and content != "log":
+        stored = stored[sorted(stored.variables, key=str)]  # as the order in a folder is arbitrary
     try:
-        return _make_uniform(path, log)
+        return _open(path, stored)
     except TimeError:
+        if content == "log":
+            raise
         return None  # its rows are placed by their stamps, like those of other files
+
+
+def _open(path: Path, stored: xr.Dataset) -> xr.Dataset:
+    try:
+        log = as_uniform(from_disk(stored, path.name))
+    except (SchemaError, TimeError) as error:
+        stored.close()
+        raise type(error)(f"{path.name}: {error}") from error
+    log.attrs.setdefault("source_files", [path.name])
+    return log
 
 
 def _open_remote(path: Path, url: str) -> xr.Dataset:
@@ -79,90 +82,72 @@ def _open_remote(path: Path, url: str) -> xr.Dataset:
             ", not a log of gyrostab; open it with xarray and give it to gyrostab.davar, or copy "
             "it here and use gyrostab ingest"
         )
-    return _open_own(path, stored)
+    return _open(path, stored)
 
 
-def _as_in_memory(path: Path, log: xr.Dataset) -> xr.Dataset:
-    """Convert units, names of axes and attributes to their form in memory."""
-    if path.is_dir():
-        log = log[sorted(log.variables, key=str)]  # the order within a directory is arbitrary
-    for variable in log.variables.values():
-        variable.attrs = decode_attributes(variable.attrs)
-    log = log.assign_coords(
-        axis=_read_labels(path, log["axis"]) if log["axis"].ndim else str(log["axis"].values)
-    )
-    log.attrs = decode_attributes(log.attrs)
-    return log
+def _is_regular(path: Path) -> bool:
+    """Return whether a file has signal, axes, stamps and sampling rate, as a regular log has.
 
-
-def _open_regular(path: Path) -> xr.Dataset | None:
-    """Open a regular log of another program undecoded, with its default fill values."""
-    zarr_format, attributes = (
-        _read_group(path) if path.is_dir() else (0, {"sampling_rate_hz": None})
-    )
-    if "sampling_rate_hz" not in attributes:
-        return None
-    engine: Any = "zarr" if path.is_dir() else "netcdf4"
-    extra: Any = {"consolidated": False} if path.is_dir() else {}
-    stored = xr.open_dataset(path, engine=engine, **_UNDECODED, **extra)
-    if not _is_regular(stored):
-        stored.close()
-        return None
-    for variable in stored.variables.values():
-        if engine == "netcdf4":
-            variable.attrs = with_default_fill(variable.attrs, variable.dtype)
-        elif zarr_format == 2 and not variable.attrs.get("_FillValue", 1):
-            del variable.attrs["_FillValue"]  # 0 is the default of Zarr
-    return stored
-
-
-def _is_regular(stored: xr.Dataset) -> bool:
-    """Return whether a dataset has signal, axes, stamps and sampling rate, as a regular log has."""
-    has_signal = any(name in stored.variables for name in SIGNAL_UNITS)
-    has_stamps = "time" in stored.variables and names_epoch(
-        str(stored.variables["time"].attrs.get("units", ""))
-    )
-    return (
-        has_signal
-        and has_stamps
-        and "sampling_rate_hz" in stored.attrs
-        and "axis" in stored.variables
-    )
-
-
-def _read_group(path: Path) -> tuple[int, dict[str, Any]]:
-    """Return format and attributes of a Zarr group, also of one that xarray cannot open."""
-    import zarr
-
-    group = zarr.open_group(path, mode="r")
-    return group.metadata.zarr_format, dict(group.attrs)
-
-
-def _read_labels(path: Path, labels: xr.DataArray) -> NDArray[np.str_]:
-    """Return the names of the axes as text; damaged names may hold invalid code points."""
-    values = np.atleast_1d(labels.values)
-    if values.dtype.kind == "U" and values.size:
-        codes = np.ascontiguousarray(values).view(
-            np.dtype(np.uint32).newbyteorder(values.dtype.byteorder)
+    The signal of a NetCDF file needs a fill value: without one, samples that were not written have
+    that of the library, which xarray does not take for missing.
+    """
+    with open_undecoded(path) as stored:
+        stamps = stored.variables.get("time")
+        signals = [stored.variables[name] for name in SIGNAL_UNITS if name in stored.variables]
+        return (
+            "sampling_rate_hz" in stored.attrs
+            and "axis" in stored.variables
+            and any(path.is_dir() or "_FillValue" in signal.attrs for signal in signals)
+            and stamps is not None
+            and _is_dated(stamps)
+            and all(_decodes_as_cf(variable.attrs) for variable in stored.variables.values())
         )
-        if codes.size and codes.max() > sys.maxunicode:
-            raise FormatError(f"{path.name}: the names of its axes are damaged; copy it again")
-    return np.array([str(label) for label in values], dtype=str)
 
 
-def _open_own(path: Path, stored: xr.Dataset) -> xr.Dataset:
-    """Open a log that gyrostab wrote."""
-    return _make_uniform(path, from_disk(stored, path.name))
+class _BoundedFile(io.BufferedReader):
+    """A file that allocates no more bytes than it holds, whatever is asked for."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return super().read(min(size or 0, os.fstat(self.fileno()).st_size))
 
 
-def _make_uniform(path: Path, log: xr.Dataset) -> xr.Dataset:
+def _check_classic_header(path: Path) -> None:
+    """Refuse a file of CDF-1 or CDF-2 whose header asks for more than the file holds.
+
+    The NetCDF library would allocate whatever a damaged header asks for; scipy maps the file.
+    """
+    with path.open("rb") as file:
+        if file.read(4) not in (b"CDF\1", b"CDF\2"):
+            return
+    from scipy.io import netcdf_file
+
+    class Header(netcdf_file):
+        def _read_gatt_array(self) -> None:
+            self._read_att_array()  # type: ignore[attr-defined]  # they would replace members of the same names
+
     try:
-        log = as_uniform(log)
-    except (SchemaError, TimeError) as error:
-        log.close()
-        raise type(error)(f"{path.name}: {error}") from error
-    log.attrs.setdefault("source_files", [path.name])
-    return log
+        Header(_BoundedFile(path.open("rb", buffering=0)), mmap=True).close()
+    except Exception as error:  # scipy raises errors of many kinds on damaged headers
+        raise FormatError(
+            f"{path.name}: the header of this NetCDF file is damaged or cut off ({error}); copy "
+            "it again"
+        ) from error
+
+
+def _decodes_as_cf(attributes: dict[Any, Any]) -> bool:
+    """Return whether xarray decodes numbers by the CF conventions; 0 is the default of Zarr."""
+    is_default_fill = not np.all(attributes.get("_FillValue", 1))
+    return not is_default_fill and not _VALID_RANGES & set(attributes)
+
+
+def _is_dated(stamps: xr.Variable) -> bool:
+    """Return whether xarray reads stamps as dates of a recording."""
+    if stamps.attrs.get("calendar", "standard") not in _CALENDARS:
+        return False
+    try:
+        return bool(decode_stamps(stamps[:1]).dtype.kind == "M")
+    except Exception:  # whatever it raises on other units and calendars
+        return False
 
 
 def summarise_log(path: Path, log: xr.Dataset) -> FileSummary:

@@ -1,104 +1,61 @@
-"""Variables of foreign NetCDF files and Zarr stores: dimensions, attributes, stored numbers."""
+"""Variables of foreign NetCDF files and Zarr stores, as they are stored."""
 
 from __future__ import annotations
 
-import base64
 import math
-import struct
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
+from gyrostab.errors import FormatError
 from gyrostab.ingest.limits import check_chunk
-from gyrostab.store.private import library_lock
-
-
-@dataclass(frozen=True)
-class StoredVariable:
-    """A variable as it is stored."""
-
-    name: str
-    dimensions: tuple[str, ...]
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    #: As in the file, with the default fill value of the format if the variable has none.
-    attributes: Mapping[str, Any]
-    #: Returns the stored numbers when indexed, while the file is open.
-    values: Any = field(repr=False)
 
 
 @contextmanager
-def open_variables(path: Path, limits: Mapping[str, float]) -> Iterator[dict[str, StoredVariable]]:
-    """Open a file or store, and describe its variables; `FormatError` if a chunk is too large."""
-    with ExitStack() as stack:
-        if path.is_dir():
-            variables = list(_zarr_variables(path))
-        else:
-            import netCDF4
-
-            with library_lock():
-                file = stack.enter_context(netCDF4.Dataset(path))
-                variables = [_netcdf_variable(variable) for variable in file.variables.values()]
-        for variable, chunks in variables:
-            check_chunk(
-                path, variable.name, variable.dtype.itemsize * math.prod(map(int, chunks)), limits
-            )
-        yield {variable.name: variable for variable, _ in variables}
-
-
-def _netcdf_variable(variable: Any) -> tuple[StoredVariable, Sequence[int]]:
-    """Describe a variable, and return the shape of its chunks, which is empty without chunks."""
-    variable.set_auto_maskandscale(False)
-    dtype = variable.dtype if isinstance(variable.dtype, np.dtype) else np.dtype(object)
-    attributes = with_default_fill(
-        {name: variable.getncattr(name) for name in variable.ncattrs()}, dtype
-    )
-    cut = variable.chunking()
-    chunks = cut if isinstance(cut, list | tuple) else ()
-    named = variable.name, variable.dimensions, variable.shape, dtype
-    return StoredVariable(*named, attributes, variable), chunks
-
-
-def _zarr_variables(path: Path) -> Iterator[tuple[StoredVariable, Sequence[int]]]:
-    import zarr
-
-    for name, array in sorted(zarr.open_group(path, mode="r").arrays()):
-        attributes = dict(array.attrs)
-        named: Any = attributes.pop("_ARRAY_DIMENSIONS", None) or getattr(
-            array.metadata, "dimension_names", None
+def open_undecoded(path: Path) -> Iterator[xr.Dataset]:
+    """Open a file or store with xarray, which decodes neither numbers nor stamps."""
+    options: dict[str, Any] = {"engine": "netcdf4"}
+    if path.is_dir():
+        options = {"engine": "zarr", "consolidated": False}
+    try:
+        stored = xr.open_dataset(
+            path, chunks=None, decode_cf=False, create_default_indexes=False, **options
         )
-        dims = [
-            dim or f"rows_{size}"
-            for dim, size in zip(named or [None] * array.ndim, array.shape, strict=True)
-        ]
-        attributes |= _zarr_fill(array, attributes)
-        described = name, tuple(map(str, dims)), array.shape, np.dtype(array.dtype)
-        yield StoredVariable(*described, attributes, array), array.chunks
+    except KeyError as error:
+        if "dimension" not in str(error):
+            raise
+        raise FormatError(
+            f"{path.name}: an array does not name its dimensions; give it the attribute "
+            "_ARRAY_DIMENSIONS (Zarr format 2) or dimension_names (format 3)"
+        ) from error
+    with stored:
+        yield stored
 
 
-def _zarr_fill(array: Any, attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the number that marks missing values.
+def find_variables(
+    path: Path, stored: xr.Dataset, limits: Mapping[str, float]
+) -> dict[str, xr.Variable]:
+    """Return the variables, with the fill value of the format if they have none.
 
-    xarray stores it as the fill value of the array in format 2, and as an attribute in format 3 (of
-    floats, eight bytes in base64). A fill value of 0 is the default of Zarr and does not
-    mark missing values.
+    `FormatError` if a chunk is too large. In Zarr format 2 the fill value of an array marks missing
+    values, except for 0, which is its default.
     """
-    if "_FillValue" in attributes:
-        value = attributes["_FillValue"]
-        if isinstance(value, str) and np.dtype(array.dtype).kind == "f":
-            value = struct.unpack("<d", base64.standard_b64decode(value))[0]
-        return {"_FillValue": value}
-    usable = (
-        array.metadata.zarr_format == 2 and array.fill_value is not None and bool(array.fill_value)
-    )
-    return {"_FillValue": array.fill_value} if usable else {}
+    variables = {str(name): variable for name, variable in stored.variables.items()}
+    for name, variable in variables.items():
+        chunks = variable.encoding.get("chunks" if path.is_dir() else "chunksizes") or ()
+        check_chunk(path, name, variable.dtype.itemsize * math.prod(map(int, chunks)), limits)
+        if not path.is_dir():
+            variable.attrs = _with_default_fill(variable.attrs, variable.dtype)
+        elif not (path / "zarr.json").exists() and not np.all(variable.attrs.get("_FillValue", 1)):
+            del variable.attrs["_FillValue"]
+    return dict(sorted(variables.items())) if path.is_dir() else variables
 
 
-def with_default_fill(attributes: dict[str, Any], dtype: Any) -> dict[str, Any]:
+def _with_default_fill(attributes: dict[Any, Any], dtype: Any) -> dict[Any, Any]:
     """Add the default fill value of the NetCDF library; bytes have none (users guide)."""
     import netCDF4
 

@@ -11,26 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.errors import FormatError, UnitError
-from gyrostab.ingest.columns.plan import Plan
-from gyrostab.ingest.columns.plan_draft import Column
-from gyrostab.ingest.columns.stamps import (
-    NAT,
-    TimeUnit,
-    names_epoch,
-    numbers_to_ns,
-    parse_time_unit,
-)
-from gyrostab.store.lazy import Converted, FileVariable, Source, make_dask
-from gyrostab.store.write import declare_counts
+from gyrostab.errors import FormatError
+from gyrostab.ingest.columns.plan import Column, Plan
+from gyrostab.ingest.columns.stamps import TimeUnit
 
 #: Stored numbers -> counts or values.
 Decoder = Callable[[Any], Any]
@@ -224,7 +212,7 @@ def fold_packing(plan: Plan, stored: Sequence[Any]) -> tuple[Plan, dict[int, Dec
             packing = Packing.from_attributes(where, variable.dtype, variable.attributes)
             column, decoders[column.source] = _fold_column(column, packing)
         columns.append(column)
-    return replace(plan, columns=tuple(columns)), decoders
+    return replace(plan, columns=columns), decoders
 
 
 def _fold_column(column: Column, packing: Packing) -> tuple[Column, Decoder]:
@@ -252,59 +240,3 @@ def _fold_time(unit: TimeUnit, packing: Packing) -> TimeUnit | None:
     ):
         return None
     return replace(unit, ns=step, epoch=None if unit.epoch is None else unit.epoch + int(shift))
-
-
-def decode_variables(path: Path, stored: xr.Dataset) -> xr.Dataset:
-    """Decode the variables of an undecoded dataset lazily, in the chunks of the file.
-
-    Packed numbers become float64, NaN where missing or invalid, and stamps datetime64[ns]; the
-    packing of whole numbers is in the encoding. Errors of later reads name `path`.
-    """
-    chunks: dict[Any, int] = {}
-    for variable in stored.variables.values():
-        chunks |= variable.encoding.get("preferred_chunks", {})
-    variables = {}
-    for key, variable in stored.variables.items():
-        source, attrs, encoding = _decode_variable(path, key, variable)
-        lazy = make_dask(source, tuple(chunks.get(dim, -1) for dim in variable.dims))
-        variables[key] = xr.Variable(variable.dims, lazy, attrs, encoding)
-    coords = {key: variables.pop(key) for key in stored.coords}
-    return xr.Dataset(variables, xr.Coordinates(coords, indexes={}), stored.attrs)
-
-
-def _decode_variable(
-    path: Path, key: Any, variable: xr.Variable
-) -> tuple[Source, dict[Any, Any], dict[Any, Any]]:
-    """Return values, attributes and encoding of a variable."""
-    source, where = FileVariable(variable, path), f"{path.name}: variable {key!r}"
-    if variable.dtype.kind not in "iuf":
-        return source, variable.attrs, variable.encoding
-    packing = Packing.from_attributes(where, variable.dtype, variable.attrs)
-    attrs = {
-        attribute: value for attribute, value in variable.attrs.items() if attribute not in _PACKING
-    }
-    chunks = {key: value for key, value in variable.encoding.items() if key == "preferred_chunks"}
-    if names_epoch(str(attrs.get("units", ""))):
-        try:
-            unit = parse_time_unit(
-                str(attrs.pop("units")), attribute_text(attrs.pop("calendar", None))
-            )
-        except UnitError as error:
-            raise UnitError(f"{where}: {error}") from error
-        read = partial(_read_stamps, packing, unit)
-        return Converted(source, read, "datetime64[ns]"), attrs, chunks
-    if packing == Packing(variable.dtype):  # every stored number is a value
-        return source, attrs, variable.encoding
-    encoding = dict(chunks)
-    if packing.dtype.kind in "iu" and packing.scale != 1.0:
-        encoding |= declare_counts(packing.dtype, packing.scale)
-        encoding |= {"add_offset": packing.offset} if packing.offset else {}
-    return Converted(source, packing.read_values, np.float64), attrs, encoding
-
-
-def _read_stamps(packing: Packing, unit: TimeUnit, stored: Any) -> NDArray[np.datetime64]:
-    folded = unit if packing.is_plain else _fold_time(unit, packing)
-    counts = packing.read_values(stored) if folded is None else packing.read_counts(stored)
-    array = np.ma.getdata(counts)
-    stamps = numbers_to_ns(array, folded or unit, 0)
-    return np.where(np.ma.getmaskarray(counts), NAT, stamps).view("datetime64[ns]")

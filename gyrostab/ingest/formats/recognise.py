@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import bz2
-import lzma
 import re
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +11,7 @@ from gyrostab.errors import FormatError
 #: Bytes at the beginning of a file that decide its format.
 _HEAD_BYTES = 8192
 
-_R_DATA = (b"RDX2\n", b"RDX3\n", b"RDA2\n", b"RDA3\n", b"X\n\0\0\0")
+_R_DATA = (".rdata", ".rda", ".rds")
 _PACKED = (b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")
 _NUMPY = b"\x93NUMPY"
 _OLD_OFFICE = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
@@ -56,7 +53,7 @@ def make_matcher(pattern: bytes, *suffixes: str) -> Callable[[Path], bool]:
 def refuse_unread(path: Path) -> None:
     """Raise an error for a file of a format that is recognised but not read."""
     head = read_head(path)
-    if _decompress_head(head).startswith(_R_DATA):
+    if path.suffix.lower() in _R_DATA or head.startswith((b"RDX", b"RDA")):
         raise FormatError(
             f"{path.name}: this is a file of R data, which is not read; save it as CSV in R: "
             "write.csv(as.data.frame(x), 'log.csv', row.names = FALSE)"
@@ -73,17 +70,3 @@ def refuse_unread(path: Path) -> None:
         )
     if head.startswith(_PACKED):
         raise FormatError(f"{path.name}: this file is packed; unpack it and give the files in it")
-
-
-def _decompress_head(head: bytes) -> bytes:
-    """Decompress the first bytes, or return them if they are not compressed."""
-    try:
-        if head.startswith(b"\x1f\x8b"):
-            return zlib.decompressobj(wbits=31).decompress(head, 16)
-        if head.startswith(b"BZh"):
-            return bz2.BZ2Decompressor().decompress(head, 16)
-        if head.startswith(b"\xfd7zXZ"):
-            return lzma.LZMADecompressor().decompress(head, 16)
-    except (OSError, EOFError, lzma.LZMAError, zlib.error):
-        return b""
-    return head

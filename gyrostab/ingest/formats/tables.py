@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.columns.headers import FileColumn
-from gyrostab.ingest.columns.plan import Plan, plan_columns
-from gyrostab.ingest.columns.plan_draft import MAX_HEADERS, Column
+from gyrostab.ingest.columns.plan import MAX_HEADERS, Column, Plan
+from gyrostab.ingest.columns.plan_columns import plan_columns
 from gyrostab.ingest.columns.stamps import NAT, parse_time_unit
 from gyrostab.ingest.columns.typed import float32_note, read_columns, summarise_columns
 from gyrostab.ingest.combine import concatenate, with_channels
@@ -91,7 +91,7 @@ class StoredArray:
         return np.asarray(held[1].take(place, axis=1 - self.along))
 
     def _read_box(self, box: Any) -> NDArray[Any]:
-        with library_lock():
+        with nullcontext() if isinstance(self.values, xr.Variable) else library_lock():
             return np.asarray(self.values[box])
 
 
@@ -192,7 +192,7 @@ class _PlannedTables:
         if self.tables[place].stamps is not None:
             clocks = [self._clock_of(begin, clock) for clock in self.plan.of("time")]
             columns = clocks + [c for c in columns if not (clocks and c.role == "time")]
-        return replace(self.plan, columns=tuple(columns))
+        return replace(self.plan, columns=columns)
 
     def _clock_of(self, source: int, planned: Column) -> Column:
         """Return the stamps of a table, in the planned unit if both clocks are stored in one."""
@@ -236,8 +236,8 @@ def _leave_out_unplaced(planned: _PlannedTables) -> _PlannedTables:
             names = list_some([column.name for column in left_out], MAX_HEADERS)
             plan = replace(
                 plan,
-                columns=tuple(column for column in plan.columns if column not in left_out),
-                notes=(*plan.notes, f"left out, as {reason}: {names}"),
+                columns=[column for column in plan.columns if column not in left_out],
+                notes=[*plan.notes, f"left out, as {reason}: {names}"],
             )
     main = [place for place in planned.main if place not in undated]
     return replace(planned, plan=plan, main=main)
@@ -308,10 +308,10 @@ def read_tables(
         plan = planned.plan_of(place)
         if place in planned.main:
             if main:
-                plan, notes = replace(plan, notes=()), []
+                plan, notes = replace(plan, notes=[]), []
             main.append(planned.read(place, plan, notes))
         elif plan.of("channel"):
-            plan = replace(plan, signal=None, kind=None, notes=())
+            plan = replace(plan, signal=None, kind=None, notes=[])
             channel_logs.append(planned.read(place, plan))
     log = with_channels(concatenate(main) if len(main) > 1 else main[0], channel_logs)
     if "axis_rows" in log.attrs:

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import gzip
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from io import BufferedReader
 from pathlib import Path
 from typing import IO, cast
 
@@ -30,8 +29,8 @@ from gyrostab.ingest.columns.dates import (
     is_time_of_day,
 )
 from gyrostab.ingest.columns.headers import FileColumn
-from gyrostab.ingest.columns.plan import Plan, plan_columns
-from gyrostab.ingest.columns.plan_draft import Column
+from gyrostab.ingest.columns.plan import Column, Plan
+from gyrostab.ingest.columns.plan_columns import plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, from_fortran
 from gyrostab.ingest.options import FileSummary, ReadOptions
@@ -51,7 +50,6 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
 #: fewer lines than the third.
 HEAD_BYTES, MAX_HEAD_BYTES, HEAD_LINES = 2**18, 2**24, 4
 BLOCK_BYTES = 2**22
-PART_BYTES = 2**16
 COUNTED_BYTES = 2**24
 #: Rises for each fall above which a column holds stamps: a clock may step back, and noise rises as
 #: often as it falls.
@@ -89,13 +87,8 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     return summary_of(plan, "text", rows, head=head, tail=tail, notes=layout.notes)
 
 
-def read(
-    path: Path,
-    options: ReadOptions,
-    *,
-    stop: Callable[[], bool] | None = None,
-) -> xr.Dataset:
-    """Return the raw log of a text file; raise `CancelledError` once `stop` returns true."""
+def read(path: Path, options: ReadOptions) -> xr.Dataset:
+    """Return the raw log of a text file; see `gyrostab.ingest.read_log`."""
     layout, plan = _plan_file(path, options)
     builder, parser, line = RawLogBuilder(plan), BlockParser(layout, plan), layout.line
 
@@ -105,8 +98,6 @@ def read(
 
     blocks = _read_blocks(path, layout.offset, growing=options.growing)
     for parsed, converted in map_in_order(parse, blocks):
-        if stop is not None and stop():
-            raise CancelledError
         builder.add(converted, partial(parsed.name_lines, line), parsed.quote_line)
         line += parsed.lines
     raw = builder.finish(layout.notes)
@@ -118,11 +109,11 @@ def read(
 
 def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
     with _open_text(path) as file:
-        size, head = HEAD_BYTES, _read_chunk(path, file, HEAD_BYTES, 0)
+        size, head = HEAD_BYTES, file.read(HEAD_BYTES)
         while (
             len(head) == size and size < MAX_HEAD_BYTES and head.count(b"\n") < HEAD_LINES
         ):  # very long lines
-            head += _read_chunk(path, file, size, size)
+            head += file.read(size)
             size *= 2
         layout = find_layout(path, head, complete=len(head) < size, limits=options.limits)
     rows = layout.full_samples
@@ -205,13 +196,23 @@ def _holds_text(path: Path) -> bool:
     try:
         with _open_text(path) as file:
             head = file.read(4096)
-    except (EOFError, zlib.error, OSError):
+    except (FormatError, OSError):
         return False
     return is_text(head) and any(48 <= code < 58 for code in head)
 
 
-def _open_text(path: Path) -> IO[bytes]:
-    return cast(IO[bytes], gzip.open(path, "rb")) if _is_gzipped(path) else path.open("rb")
+@contextmanager
+def _open_text(path: Path) -> Iterator[IO[bytes]]:
+    """Open a text file, plain or gzipped; `FormatError` where a gzip stream is damaged."""
+    with gzip.open(path, "rb") if _is_gzipped(path) else path.open("rb") as file:
+        try:
+            yield cast(IO[bytes], file)
+        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+            raise FormatError(
+                f"{path.name}: the gzip stream is damaged or cut off; {file.tell():,} bytes of "
+                f"text could be read before that ({error}). copy the file again, or save the "
+                f"readable part with: gzip -dc {path.name} > rescued.csv"
+            ) from error
 
 
 def read_head(path: Path) -> str:
@@ -222,37 +223,12 @@ def read_head(path: Path) -> str:
         return file.read(4096).decode("latin-1")
 
 
-def _read_chunk(path: Path, file: IO[bytes], size: int, done: int) -> bytes:
-    """Read up to `size` bytes; fewer only at the end of the file."""
-    if isinstance(file, BufferedReader):
-        return file.read(size)
-    parts: list[bytes] = []
-    missing = size
-    try:
-        while missing > 0 and (part := file.read(min(missing, PART_BYTES))):
-            parts.append(part)
-            missing -= len(part)
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        read = done + size - missing
-        problem = (
-            f"the gzip stream is damaged or cut off; {read:,} bytes of text could be read "
-            f"before that ({error})"
-        )
-        rescue = (
-            f"copy the file again, or save the readable part with: gzip -dc {path.name} > "
-            "rescued.csv"
-        )
-        raise FormatError(f"{path.name}: {problem}. {rescue}") from error
-    return b"".join(parts)
-
-
 def _read_blocks(path: Path, offset: int, *, growing: bool = False) -> Iterator[bytes]:
     """Yield the data rows in blocks that end with a line; of a growing file, whole lines only."""
     with _open_text(path) as file:
-        done = len(_read_chunk(path, file, offset, 0))
+        file.read(offset)
         rest = b""
-        while chunk := _read_chunk(path, file, BLOCK_BYTES, done):
-            done += len(chunk)
+        while chunk := file.read(BLOCK_BYTES):
             cut = chunk.rfind(b"\n") + 1
             if cut == 0:
                 rest += chunk

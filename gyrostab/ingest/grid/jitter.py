@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.kernels.grid.course import follow
+from gyrostab.kernels.grid.course import LOSS_NATS, follow
 from gyrostab.kernels.grid.stamps import NO_STAMP, piece_sums
 
 Integers = NDArray[np.int64]
@@ -30,6 +30,10 @@ _SEARCH_GAIN, GAIN = 0.02, 0.005
 
 #: Largest scatter [samples]; beyond it, an undetected loss costs less than 80 nats.
 _MAX_SIGMA = 0.8
+
+#: Largest scatter of stamps [samples] at which a period is found if losses cost less [nats], with
+#: one row in ten after a loss: uniform phases, which agree with any period, scatter by 0.37.
+_MAX_LOSSY_SIGMA, _LOSSY_NATS = 0.35, 2.2
 
 #: Largest share of rows without a sample, and largest cost of a row [nats], of stamps that fit the
 #: model. Jitter alone costs 0.5 nats; every second sample missing at random costs 2.5 more.
@@ -56,6 +60,7 @@ class JitterModel:
     observe: str
     group: float  # mean number of rows for each used stamp
     nats: float  # cost of a row
+    loss_nats: float = LOSS_NATS  # cost of a loss, in the search for the sequence of samples
     #: Whether few rows have no sample, some steps are single samples, and the cost is that of
     #: jitter.
     fits: bool = True
@@ -79,45 +84,55 @@ def observe_rows(stamps: Integers, observe: str, period: float) -> Integers:
 
 
 def fit_jitter(
-    parts: list[Integers], guesses: list[float], observe: str, *, sure: float
+    parts: list[Integers], guesses: list[tuple[float, float]], observe: str, *, sure: float
 ) -> JitterModel | None:
-    """Fit the sampling period that explains stretches of stamps best, with rare lost samples.
+    """Fit the sampling period that explains stretches of stamps best, with lost samples.
 
-    The stamps are `NO_STAMP` where unreadable. `guesses` are periods to try in addition to those
-    found in the stretches [ns]; `observe` names the rows to use (see `JitterModel`); `sure` is the
-    number of samples over which counting by the first estimate of the period is reliable.
+    The stamps are `NO_STAMP` where unreadable. `guesses` are periods [ns] and jitter [samples] to
+    try in addition to those found in the stretches; `observe` names the rows to use (see
+    `JitterModel`); `sure` is the number of samples over which counting by the first estimate of the
+    period is reliable.
     """
-    observed = _observe_parts(parts, observe, guesses[0])
+    observed = _observe_parts(parts, observe, guesses[0][0])
+    group = _rows_per_group(observed)
+    sure *= max(1.0, group)
+    started = [*_start_on_lines(observed, observe, group, sure), *guesses]
+    models = [
+        _refine_model(observed, JitterModel(period, sigma, observe, group, np.inf), sure)
+        for period, sigma in started
+    ]
+    known = [
+        model
+        for model in filter(None, models)
+        if model.sigma <= _MAX_LOSSY_SIGMA or model.loss_nats > _LOSSY_NATS
+    ]
+    explained = min(known, key=lambda jitter: jitter.code_length, default=None)
+    return (
+        explained if explained is not None and explained.fits else None
+    )  # the best may fit stamps of doubled rows
+
+
+def _start_on_lines(
+    observed: list[ObservedStamps], observe: str, group: float, sure: float
+) -> list[tuple[float, float]]:
+    """Return the best periods [ns] near the slopes of stretches, and their jitter [samples]."""
     lengths = (
         (32, 16) if observe == "all" else (8,)
     )  # with lost samples, only few consecutive groups are complete
     lines = next(filter(None, (_fit_lines(observed, length) for length in lengths)), None)
     if lines is None or not (lines[0] > 0).any():
-        return None
+        return []
     slope, scatter = (values[lines[0] > 0] for values in lines)
     sigma_ns = float(np.median(scatter))
-    group = _rows_per_group(observed)
     if sigma_ns > _MAX_SIGMA * float(np.median(slope)):
-        return None
-    sure *= max(1.0, group)
+        return []
     periods = _candidate_periods(observed, slope, group)
     n_rows = max(64, _SEARCH_ROWS // len(observed))
     sample = [(count[:n_rows], stamps[:n_rows]) for count, stamps in observed]
     best = sorted(periods, key=lambda period: _row_cost(sample, period, sigma_ns, sure))[
         :_MAX_REFINED
     ]
-    started = [
-        *((period, sigma_ns / period) for period in best),
-        *((guess, MIN_SIGMA) for guess in guesses),
-    ]
-    models = [
-        _refine_model(observed, JitterModel(period, sigma, observe, group, np.inf), sure)
-        for period, sigma in started
-    ]
-    explained = min(filter(None, models), key=lambda jitter: jitter.code_length, default=None)
-    return (
-        explained if explained is not None and explained.fits else None
-    )  # the best may fit stamps of doubled rows
+    return [(period, sigma_ns / period) for period in best]
 
 
 def fit_jitter_near(
@@ -195,7 +210,7 @@ def _row_cost(observed: list[ObservedStamps], period: float, sigma_ns: float, su
     """Return the mean cost of a row [nats] for a period [ns]."""
     sigma = max(sigma_ns / period, MIN_SIGMA)
     total = sum(
-        follow(count, stamps, period, sigma, _SEARCH_GAIN, sure * period, TRACE_ROWS)[3]
+        follow(count, stamps, period, sigma, _SEARCH_GAIN, sure * period, LOSS_NATS, TRACE_ROWS)[3]
         for count, stamps in observed
     )
     return float(total / sum(len(count) for count, _ in observed))
@@ -207,14 +222,14 @@ def _refine_model(
     """Refine period and jitter along the sequence of samples; None if the fit fails."""
     if not observed:
         return None
-    period, sigma = jitter.period, jitter.sigma
+    period, sigma, loss_nats = jitter.period, jitter.sigma, LOSS_NATS
     for gain in (_SEARCH_GAIN, _SEARCH_GAIN / 2, GAIN, GAIN):
         cc = ct = nats = rows = dropped = single = steps = 0.0
-        offs = []
+        offs, losses = [], []
         for count, stamps in observed:
             floored_sigma = max(sigma, MIN_SIGMA)
             sample, piece, off, cost = follow(
-                count, stamps, period, floored_sigma, gain, sure * period, TRACE_ROWS
+                count, stamps, period, floored_sigma, gain, sure * period, loss_nats, TRACE_ROWS
             )
             is_near = _is_near(off, sigma)
             sums = piece_sums(stamps[is_near], sample[is_near], piece[is_near], period)
@@ -227,10 +242,14 @@ def _refine_model(
             dropped += (np.maximum(count_step - sample_step, 0)).sum()
             single, steps = single + (sample_step == count_step).sum(), steps + len(sample_step)
             offs.append(off)
+            losses.append(np.maximum(sample_step - count_step, 0))
         if cc <= 0:
             return None
         period = float(ct / cc)
         sigma = 1.4826 * float(np.median(np.abs(np.concatenate(offs))))
+        lost = np.concatenate(losses)
+        nats += len(lost) * _loss_entropy(lost) - _loss_cost(lost, loss_nats)
+        loss_nats = _fit_loss_nats(lost)
         if not abs(period / jitter.period - 1) < most_off or sigma > 2 * _MAX_SIGMA:
             return None
     fits = (
@@ -239,7 +258,25 @@ def _refine_model(
         and nats < _MAX_NATS * rows
         and single > 0.1 * steps
     )
-    return JitterModel(period, sigma, jitter.observe, jitter.group, nats / rows, fits)
+    return JitterModel(period, sigma, jitter.observe, jitter.group, nats / rows, loss_nats, fits)
+
+
+def _loss_entropy(lost: Integers) -> float:
+    """Return the mean code length of the samples lost before each row [nats]."""
+    shares = np.unique(lost, return_counts=True)[1] / max(1, len(lost))
+    return -float(shares @ np.log(shares))
+
+
+def _loss_cost(lost: Integers, loss_nats: float) -> float:
+    """Return the cost of losses in the search for the sequence of samples [nats]."""
+    lost = lost[lost > 0]
+    return loss_nats * len(lost) + float(np.log(lost).sum())
+
+
+def _fit_loss_nats(lost: Integers) -> float:
+    """Return the cost of a loss that follows from the share of rows after losses [nats]."""
+    share = float(np.clip(np.mean(lost > 0) if len(lost) else 0.0, 1e-9, 0.5))
+    return min(LOSS_NATS, float(np.log((1 - share) / share)))
 
 
 def _is_near(off: NDArray[np.float64], sigma: float) -> NDArray[np.bool_]:
@@ -261,6 +298,7 @@ def count_samples(
         max(jitter.sigma, MIN_SIGMA),
         GAIN,
         longest,
+        jitter.loss_nats,
         TRACE_ROWS,
     )
     is_near = _is_near(off, jitter.sigma)

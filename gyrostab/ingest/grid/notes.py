@@ -24,6 +24,10 @@ from gyrostab.schema import log_channels
 from gyrostab.time.grid import grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
+#: Scatter of stamps [samples] above which, and share of rows without a sample above which, the
+#: rate may be wrong if many samples are missing.
+_UNCERTAIN_SIGMA, _MANY_SHARE = 0.3, 0.05
+_IF_HIGHER = "; if many samples are missing, the sampling rate may be higher: give it with --rate"
 _MAX_NAMED = 5  # events of one kind that are listed one by one
 #: Rows of which the steps of angles are taken, and the least number.
 _STEP_ROWS, _MIN_STEP_ROWS = 2**14, 100
@@ -100,19 +104,22 @@ def describe_rate(
             if placement.wander >= 1
             else ""
         )
-        notes.append(f"{where}: {reason}: rows are placed by their count at {rate:.10g} Hz{reach}")
+        notes.append(
+            f"{where}: {reason}: rows are placed by their count at {rate:.10g} Hz{reach}"
+            f"{_IF_HIGHER}"
+        )
     jitter = estimate.jitter
     if jitter is not None and (jitter.group >= 2 or jitter.sigma < MIN_SIGMA):
         notes.append(
             f"{where}: {reason}: rows are placed in their order at {rate:.10g} Hz; samples are "
-            "missing where a group comes late"
+            f"missing where a group comes late{_IF_HIGHER}"
         )
     elif jitter is not None:
         notes.append(
             f"{where}: the stamps scatter by {format_duration(jitter.sigma / rate)}, "
             f"{jitter.sigma:.2g} of a sampling interval, "
             f"as times of arrival do: rows keep their order at {rate:.10g} Hz, and a missing "
-            "sample is located to a few rows"
+            f"sample is located to a few rows{_IF_HIGHER * (jitter.sigma > _UNCERTAIN_SIGMA)}"
         )
     if estimate.even is not None:
         notes.append(
@@ -124,11 +131,9 @@ def describe_rate(
         )
     if estimate.finer is not None:
         notes.append(
-            f"{where}: the steps between stamps recur as if a log at {estimate.finer:g} Hz lost "
-            "the same rows again and again, or as if "
-            f"rows were read in groups; they are taken for even samples at {rate:.10g} Hz: if "
-            "rows are missing, "
-            f"give --rate {estimate.finer:g}"
+            f"{where}: the stamps lie near multiples of the period of {estimate.finer:g} Hz, as if "
+            "rows of a log at that rate were missing; they are taken for even samples at "
+            f"{rate:.10g} Hz: if rows are missing, give --rate {estimate.finer:g}"
         )
     off = abs(estimate.raw / rate - 1)
     if off * placement.size > 1 and off > 2 * estimate.error / rate:
@@ -216,6 +221,8 @@ def describe_placement(
         notes.append(
             f"{where}: dropped, because another row holds their sample: "
             f"{_count_of(len(twice), 'row')}, first {_name_row(raw, int(twice[:, 2].min()))}"
+            + _IF_HIGHER
+            * (len(twice) > _MANY_SHARE * scanned.rows)
         )
     late = events[events[:, 0] == OUT_OF_ORDER]
     n_placed = int((samples_of(placement, late[:, 2]) >= 0).sum())

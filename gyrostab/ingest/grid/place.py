@@ -35,6 +35,9 @@ NO_STAMPS = (
     "or give --rate HZ for a log without time"
 )
 
+#: Largest distance of the smoothed stamps from the grid before a sample is skipped [samples].
+HOLD = 0.75
+
 #: Rows that the placement kernel processes at one time.
 _STRETCH_ROWS = 1 << 18
 
@@ -134,13 +137,10 @@ def append_runs(
         runs.append(table)
 
 
-def place_by_stamp(
-    stamps: Stamps, rate: float, *, tolerance: float, max_gap: float, where: str
-) -> Placement:
+def place_by_stamp(stamps: Stamps, rate: float, *, max_gap: float, where: str) -> Placement:
     """Place rows by their stamps; the result does not depend on the size of their blocks.
 
-    `tolerance` is the largest distance of the smoothed stamps from the grid, beyond half a sample,
-    before a sample is skipped [samples]; a step ahead above `max_gap` [s] is a step of the clock.
+    A step ahead above `max_gap` [s] is a step of the clock.
     """
     period = sum(period_ns(rate))
     state, ring = kernel.new_state()
@@ -151,9 +151,7 @@ def place_by_stamp(
         if len(first) == 0:
             first = readable_stamps(values)[:_FIRST_STAMPS]
         n = _STRETCH_ROWS if len(rows) == _STRETCH_ROWS + LOOK_AHEAD else len(rows)
-        new, happened = kernel.place(
-            rows, values, n, period, 0.5 + tolerance, max_gap * rate, state, ring
-        )
+        new, happened = kernel.place(rows, values, n, period, HOLD, max_gap * rate, state, ring)
         runs.append(new)
         events.append(happened)
     if not state[kernel.STARTED]:
@@ -185,37 +183,31 @@ class _Windows(NamedTuple):
 
 def _make_windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, int]:
     """Make windows of `width` rows; also return the first stamp [ns]."""
+    blocks = (readable_stamps(values) for _, values in stamps())
+    zero = next((int(readable[0]) for readable in blocks if len(readable)), 0)
     parts: list[tuple[NDArray[Any], ...]] = []
-    pending = np.empty(0, dtype=np.int64)
-    first: int | None = None
     last: list[float] = []  # lead at the end of the previous window
     done = 0
-
-    def summarise(values: NDArray[np.int64], first_row: int, zero: int) -> None:
-        table = values.reshape(-1, width) if len(values) >= width else values[None]
-        ahead = (table - zero) / period - (np.arange(values.size) + first_row).reshape(table.shape)
-        ahead[table == NO_STAMP] = np.nan
-        # a row without a readable stamp has the lead of the last one before it
-        leads = pd.Series(np.concatenate([last, ahead.ravel()])).ffill().bfill().fillna(0.0)
-        filled = leads.to_numpy()[len(last) :].reshape(table.shape)
-        step = np.diff(filled.ravel(), prepend=leads.iloc[0]).reshape(table.shape)
-        last[:] = [filled[-1, -1]]
-        at = np.arange(len(table)) * width + first_row
-        low, high = filled.min(axis=1), filled.max(axis=1)
-        reach = np.quantile(filled, 0.9, axis=1) - low
-        parts.append((low, high, reach, at + step.argmax(axis=1), at + step.argmin(axis=1)))
-
-    for _, values in stamps():
-        pending = np.concatenate([pending, values])
-        if first is None and (pending != NO_STAMP).any():
-            first = int(pending[pending != NO_STAMP][0])
-        n = len(pending) // width * width
-        if n and first is not None:
-            summarise(pending[:n], done, first)
-            pending, done = pending[n:], done + n
-    if first is not None and (len(pending) >= width // 2 or not parts) and len(pending):
-        summarise(pending, done, first)
-    return _Windows(*map(np.concatenate, zip(*parts, strict=True))), int(first or 0)
+    for _, values in recut_blocks(stamps, max(1, _STRETCH_ROWS // width) * width):
+        table = values[: len(values) // width * width].reshape(-1, width)
+        rest = values[table.size :]  # only the last block has one
+        tables = [table, rest[None]] if len(rest) >= width // 2 else [table]
+        for window in tables if parts or table.size else [values[None]]:
+            if not window.size:
+                continue
+            ahead = (window - zero) / period - (np.arange(window.size) + done).reshape(window.shape)
+            ahead[window == NO_STAMP] = np.nan
+            # a row without a readable stamp has the lead of the last one before it
+            leads = pd.Series(np.concatenate([last, ahead.ravel()])).ffill().bfill().fillna(0.0)
+            filled = leads.to_numpy()[len(last) :].reshape(window.shape)
+            step = np.diff(filled.ravel(), prepend=leads.iloc[0]).reshape(window.shape)
+            last = [filled[-1, -1]]
+            at = np.arange(len(window)) * window.shape[1] + done
+            low, high = filled.min(axis=1), filled.max(axis=1)
+            reach = np.quantile(filled, 0.9, axis=1) - low
+            parts.append((low, high, reach, at + step.argmax(axis=1), at + step.argmin(axis=1)))
+            done += window.size
+    return _Windows(*map(np.concatenate, zip(*parts, strict=True))), zero
 
 
 def _find_jumps(windows: _Windows) -> tuple[list[tuple[int, float, float]], float]:

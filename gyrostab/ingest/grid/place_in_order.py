@@ -16,7 +16,7 @@ from gyrostab.ingest.grid.jitter import (
     JitterModel,
     observe_rows,
 )
-from gyrostab.ingest.grid.place import NO_STAMPS, Placement, append_runs, make_placement
+from gyrostab.ingest.grid.place import HOLD, NO_STAMPS, Placement, append_runs, make_placement
 from gyrostab.ingest.grid.starting_period import SECOND, Stamps, recut_blocks
 from gyrostab.kernels.grid.course import find_breaks, find_phase, trace
 from gyrostab.kernels.grid.stamps import DUPLICATE, RESTART, STEP
@@ -33,8 +33,8 @@ _LATE_SAMPLES = 16.0
 class _Placer:
     """Assign samples to rows, stretch by stretch."""
 
-    def __init__(self, jitter: JitterModel, period: float, hold: float, max_gap_ns: float):
-        self.jitter, self.period, self.hold, self.max_gap_ns = jitter, period, hold, max_gap_ns
+    def __init__(self, jitter: JitterModel, period: float, max_gap_ns: float):
+        self.jitter, self.period, self.max_gap_ns = jitter, period, max_gap_ns
         self.sigma = max(jitter.sigma, MIN_SIGMA)
         self.start: int | None = None
         self.latest = 0
@@ -106,8 +106,9 @@ class _Placer:
                 self.period,
                 self.sigma,
                 GAIN,
-                self.hold,
+                HOLD,
                 self.max_gap_ns / self.period,
+                self.jitter.loss_nats,
                 self.level,
                 self.phase,
                 self.observed,
@@ -155,7 +156,6 @@ def place_in_order(
     jitter: JitterModel,
     rate: float,
     *,
-    tolerance: float,
     max_gap: float,
     by_row: bool,
     where: str,
@@ -167,7 +167,7 @@ def place_in_order(
     """
     ahead = int(min(_AHEAD_ROWS * np.ceil(jitter.group), _MAX_AHEAD_ROWS))
     size = int(min(TRACE_ROWS * np.ceil(jitter.group), _MAX_ROWS))
-    placer = _Placer(jitter, sum(period_ns(rate)), 0.5 + tolerance, max_gap * SECOND)
+    placer = _Placer(jitter, sum(period_ns(rate)), max_gap * SECOND)
     for number, (rows, values) in enumerate(recut_blocks(stamps, size, ahead)):
         count = rows if by_row else np.arange(number * size, number * size + len(rows))
         placer.add(rows, count, values, size if len(rows) == size + ahead else len(rows))

@@ -33,7 +33,8 @@ from gyrostab.ingest.grid.scan_pass import ScanPass, file_of, stamp_blocks
 from gyrostab.ingest.grid.starting_period import Stamps
 from gyrostab.schema import signal_name
 from gyrostab.store.lazy import find_source, read_slice
-from gyrostab.time.grid import period_ns, stamp_ns
+from gyrostab.time.grid import period_ns
+from gyrostab.time.stamps import stamp_ns
 
 _MAX_RATE_DIFFERENCE = 0.02  # relative, between declared and estimated rate
 _EVEN_ROWS = 2**18  # rows at the beginning that give the rate of a log with even stamps
@@ -52,9 +53,7 @@ class RowPlacer:
     raw: xr.Dataset
     scanned: ScanPass
     declared: float | None  # sampling rate [Hz]; found from the stamps if None
-    tolerance: float  # as for `place_by_stamp`
     max_gap: float  # a longer step ahead is a step of the clock [s]
-    block: int  # rows in memory at one time
 
     def place(self) -> tuple[Placement, float, list[str]]:
         """Return the placement, the sampling rate [Hz] and notes."""
@@ -101,7 +100,7 @@ class RowPlacer:
             return self._place_without_time()
         # single unreadable rows still occupy samples
         count_all_rows = scanned.absent <= 0.01 * scanned.rows
-        stamps: Stamps = partial(stamp_blocks, raw, scanned, block=self.block)
+        stamps: Stamps = partial(stamp_blocks, raw, scanned)
         try:
             estimate = estimate_rate(stamps, where=self.where)
         except TimeError:
@@ -117,7 +116,7 @@ class RowPlacer:
             rate, estimate = declared, replace(estimate, finer=None, even=None)
         deviating: list[tuple[int, int, float]] = []
         if estimate.counted:
-            counted = partial(stamp_blocks, raw, scanned, block=self.block, all_rows=count_all_rows)
+            counted = partial(stamp_blocks, raw, scanned, all_rows=count_all_rows)
             placement = place_by_count(counted, estimate, rate, max_gap=self.max_gap)
         else:
             placement = self._place_stamped(stamps, estimate.jitter, rate, count_all_rows)
@@ -172,11 +171,7 @@ class RowPlacer:
     ) -> Placement:
         """Place rows by their stamps, or in order if stamps have jitter."""
         scanned = self.scanned
-        options: dict[str, Any] = {
-            "tolerance": self.tolerance,
-            "max_gap": self.max_gap,
-            "where": self.where,
-        }
+        options: dict[str, Any] = {"max_gap": self.max_gap, "where": self.where}
 
         def place_along(jitter: JitterModel) -> Placement:
             def place() -> Placement:  # repetitions occupy no samples

@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
-from gyrostab.ingest.grid.jitter import JitterModel, fit_jitter, fit_jitter_near
+from gyrostab.ingest.grid.comb import MIN_TICKS, clock_tick, comb_peaks, losses_accumulate
+from gyrostab.ingest.grid.jitter import MIN_SIGMA, JitterModel, fit_jitter, fit_jitter_near
 from gyrostab.ingest.grid.period_fit import fit_pieces, longest_step, pool_pieces
 from gyrostab.ingest.grid.starting_period import (
+    LONGEST,
     SECOND,
     SHARED_SHARE,
     Stamps,
@@ -30,6 +32,7 @@ from gyrostab.ingest.grid.starting_period import (
     sample_stretches,
     starting_period,
     step_scatter,
+    time_per_row,
 )
 from gyrostab.kernels.grid.stamps import NO_STAMP
 
@@ -60,7 +63,7 @@ class RateEstimate:
     #: Rate [Hz] if the recurring losses found in the stamps are not losses; None without such
     #: losses.
     even: float | None = None
-    #: Rate [Hz] if the pattern of steps is due to recurring losses; None without such a pattern.
+    #: Higher rate [Hz] near whose samples the stamps lie, if rows are missing; None without one.
     finer: float | None = None
     #: Jitter of the stamps, if single stamps do not give the sample but many together do.
     jitter: JitterModel | None = None
@@ -119,16 +122,23 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
         or step_scatter(steps, period) > _SHARP_SCATTER
         or np.mean(steps == 0) >= SHARED_SHARE
     ):
-        jitter = _fit_jitter(stretches, period, coarse, sure)
+        peaks = [] if coarse else comb_peaks(parts)
+        guesses = [(period, MIN_SIGMA)]
+        if peaks and losses_accumulate(parts):
+            guesses += [peak for peak in peaks if peak[0] > MIN_TICKS * clock_tick(parts)]
+        jitter = _fit_jitter(stretches, guesses, coarse, sure)
         if jitter is not None:
-            return _estimate_with_jitter(stamps, jitter, coarse, sure)
+            estimate = _estimate_with_jitter(stamps, jitter, coarse, sure)
+            return replace(estimate, finer=_finer_rate(stretches, peaks, jitter, sure))
+        if np.mean(steps == 0) >= SHARED_SHARE:  # rows are not doubled: that would fit
+            period, counted, coarse = time_per_row(stretches, ticks=True), True, True
     longest = longest_step(parts, period) if counted else sure * period
     estimate = _estimate_pooled(stamps, period, longest, counted=counted, coarse=coarse)
     return estimate if finer is None else replace(estimate, finer=float(f"{SECOND / finer:.4g}"))
 
 
 def _fit_jitter(
-    parts: list[NDArray[np.int64]], period: float, coarse: bool, sure: float
+    parts: list[NDArray[np.int64]], guesses: list[tuple[float, float]], coarse: bool, sure: float
 ) -> JitterModel | None:
     """Fit the jitter of noisy stamps, of all rows or of one row of each group.
 
@@ -141,11 +151,11 @@ def _fit_jitter(
         once = [part[np.append(np.diff(part) != 0, True)] for part in parts]
         rows, apart = sum(map(len, parts)), sum(map(len, once))
         readings = [parts, once] if (1 - SHARED_SHARE) * rows < apart < rows else [parts]
-        models = [fit_jitter(reading, [period], "all", sure=sure) for reading in readings]
+        models = [fit_jitter(reading, guesses, "all", sure=sure) for reading in readings]
         best = min(filter(None, models), key=attrgetter("code_length"), default=None)
         if best is not None:
             return best
-    return fit_jitter(parts, [period], "first" if coarse else "last", sure=sure)
+    return fit_jitter(parts, guesses, "first" if coarse else "last", sure=sure)
 
 
 def _estimate_with_jitter(
@@ -155,6 +165,21 @@ def _estimate_with_jitter(
     longest = sure * jitter.period * max(1.0, jitter.group)
     estimate = _estimate_pooled(stamps, jitter.period, longest, jitter=jitter)
     return replace(estimate, coarse=coarse, jitter=jitter)
+
+
+def _finer_rate(
+    parts: list[NDArray[np.int64]],
+    peaks: list[tuple[float, float]],
+    jitter: JitterModel,
+    sure: float,
+) -> float | None:
+    """Return a higher rate [Hz] that explains the stamps better, with recurring losses."""
+    shorter = [period for period, _ in peaks if 1 < jitter.period / period < LONGEST]
+    models = [fit_jitter_near(parts, period, "all", sure=sure) for period in shorter]
+    best = min(filter(None, models), key=attrgetter("code_length"), default=None)
+    if best is None or best.period > 0.9 * jitter.period or best.code_length > jitter.code_length:
+        return None
+    return float(f"{SECOND / best.period:.4g}")
 
 
 def _mean_rate(parts: list[NDArray[np.int64]]) -> float:

@@ -11,15 +11,15 @@ from typing import Any
 
 import xarray as xr
 
-from gyrostab.errors import OptionError
-from gyrostab.ingest.concat import concatenate_logs, split_axes
+from gyrostab.ingest.concat.axes import split_axes
+from gyrostab.ingest.concat.core import concatenate_logs
 from gyrostab.ingest.gap_table import gap_variables, name_lost, sort_gaps
 from gyrostab.ingest.grid.fill import count_placed, gather_channel, rows_on_grid
 from gyrostab.ingest.grid.gaps import find_gaps
 from gyrostab.ingest.grid.notes import describe_angles, describe_channels, describe_placement
 from gyrostab.ingest.grid.place import Placement, check_grid
 from gyrostab.ingest.grid.place_rows import RowPlacer
-from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, scan_rows
+from gyrostab.ingest.grid.scan_pass import ScanPass, file_of, scan_rows
 from gyrostab.ingest.limits import check_limits
 from gyrostab.ingest.uniform import as_uniform, check_same_rate
 from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts
@@ -43,17 +43,6 @@ _OWN_ATTRIBUTES = (
     "history",
     "unreadable_spans",
 )
-
-
-def _check_options(*, rate: float | None, tolerance: float, chunk: int | None, block: int) -> None:
-    if rate is not None:
-        check_rate(rate, "rate")
-    if not 0 <= tolerance < 0.5:
-        raise OptionError(f"tolerance={tolerance!r} must be at least 0 and below 0.5 samples")
-    if (chunk is not None and chunk < 1) or block < 64:
-        raise OptionError(
-            f"chunk={chunk!r} and block={block!r} count samples and rows; give at least 1 and 64"
-        )
 
 
 def _is_on_grid(channel: Any, n_filled: int, scanned: ScanPass, placement: Placement) -> bool:
@@ -133,10 +122,7 @@ def regularise(
     raw: xr.Dataset,
     *,
     rate: float | None = None,
-    tolerance: float = 0.25,
     max_gap: str | float = "10D",
-    chunk: int | None = None,
-    block: int = BLOCK_ROWS,
     limits: Mapping[str, float] | None = None,
 ) -> xr.Dataset:
     """Place the rows of a raw log on a uniform time axis, NaN where missing, with a table of gaps.
@@ -149,16 +135,9 @@ def regularise(
         its uniform time by `gyrostab.ingest.uniform.as_uniform`.
     rate : float, optional
         Sampling rate [Hz]; estimated from the stamps by default, and checked against them if given.
-    tolerance : float
-        Largest distance of the smoothed stamps from the grid, beyond half a sample, before a sample
-        is skipped [samples].
     max_gap : str or float
         A longer step of the stamps ahead is taken as a step of the clock, not as a gap; a number
         is in seconds.
-    chunk : int, optional
-        Samples in a chunk of the lazy arrays; about 20 minutes by default, as in a stored log.
-    block : int
-        Rows in memory at one time; does not affect the result.
     limits : mapping of str to float, optional
         Limits of `gyrostab.ingest.limits` with other values; ``grid_samples`` bounds the samples of
         an axis.
@@ -196,7 +175,8 @@ def regularise(
     >>> log.attrs["sampling_rate_hz"]
     100.0
     """
-    _check_options(rate=rate, tolerance=tolerance, chunk=chunk, block=block)
+    if rate is not None:
+        check_rate(rate, "rate")
     is_log = isinstance(raw, xr.Dataset) and "row" not in raw.dims
     if is_log and "sampling_rate_hz" in raw.attrs:
         log = as_uniform(raw)
@@ -207,24 +187,21 @@ def regularise(
     if "axis_rows" in raw.attrs:
         options: dict[str, Any] = {"max_gap": max_gap, "limits": limits}
         parts = [part.assign_attrs(notes=[]) for part in split_axes(raw)]
-        logs = [
-            regularise(part, rate=rate, tolerance=tolerance, chunk=chunk, block=block, **options)
-            for part in parts
-        ]
+        logs = [regularise(part, rate=rate, **options) for part in parts]
         labels, note = _describe_axes(raw.attrs["axis_rows"], parts, logs)
         log = concatenate_logs(logs, labels, **options)
         return log.assign_attrs(notes=[*texts(raw, "notes"), *texts(log, "notes"), note])
     gap_limit = duration_seconds(max_gap, "max_gap")
     name = signal_name(raw)
     allowed = check_limits(limits)
-    scanned = scan_rows(raw, name, block=block)
+    scanned = scan_rows(raw, name)
     given = rate if rate is not None else raw.attrs.get("declared_rate_hz")
     declared = None if given is None else float(given)
-    placer = RowPlacer(raw, scanned, declared, tolerance, gap_limit, block)
+    placer = RowPlacer(raw, scanned, declared, gap_limit)
     placement, hertz, notes = placer.place()
     check_grid(raw, placement, hertz, gap_limit, allowed)
     check_span(placement.start, hertz, placement.size, file_of(raw)[0])
-    chunk = chunk or chunk_samples(hertz)
+    chunk = chunk_samples(hertz)
     table = name_lost(
         find_gaps(placement, scanned), raw.attrs.get("unreadable_spans", ()), placement.start, hertz
     )

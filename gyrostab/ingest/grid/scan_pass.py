@@ -6,7 +6,7 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -52,26 +52,19 @@ class ScanPass:
         return bits[begin % 8 : begin % 8 + end - begin].astype(bool)
 
 
-class _Block(NamedTuple):
-    """Findings in a block of rows."""
-
-    bits: NDArray[np.uint8]
-    absent: int
-    unreadable: NDArray[np.int64]
-    infinite: NDArray[np.int64]
-    low: NDArray[np.float64]  # (n_axes,): range of the finite values
-    high: NDArray[np.float64]
-    filled: list[int]
-
-
 def _scan_block(
     raw: xr.Dataset, name: str, channels: Sequence[str], ends: tuple[int, int]
-) -> _Block:
+) -> tuple[Any, ...]:
+    """Return what rows hold.
+
+    These are: presence as bits, absent rows, spans of unreadable and infinite cells, the range of
+    each axis, and the filled rows of each channel.
+    """
     cells = np.asarray(read_slice(raw[name].data, *ends), dtype=np.float64)
     is_nan, is_infinite = np.isnan(cells), np.isinf(cells)
     present, infinite = ~is_nan.all(axis=0), is_infinite.any(axis=0)
     finite = np.where(is_infinite, np.nan, cells) if infinite.any() else cells
-    return _Block(
+    return (
         np.packbits(present),
         present.size - int(np.count_nonzero(present)),
         find_spans(is_nan.any(axis=0) & present, ends[0]),
@@ -88,57 +81,47 @@ def find_spans(bad: Any, offset: int) -> NDArray[np.int64]:
     return np.asarray(edges.reshape(-1, 2) + offset, dtype=np.int64)
 
 
-def scan_rows(raw: xr.Dataset, name: str, *, block: int = BLOCK_ROWS) -> ScanPass:
+def scan_rows(raw: xr.Dataset, name: str) -> ScanPass:
     """Scan every cell of a raw log once; `FormatError` when no row holds a number."""
     rows = raw.sizes["row"]
-    block -= block % 8
+    block = BLOCK_ROWS // 8 * 8
     channels = [str(key) for key, variable in raw.data_vars.items() if variable.dims == ("row",)]
-    spans = ((begin, min(rows, begin + block)) for begin in range(0, rows, block))
-    blocks = list(map_in_order(partial(_scan_block, raw, name, channels), spans))
-    absent = sum(part.absent for part in blocks)
-    low = np.min([part.low for part in blocks], axis=0, initial=np.inf)
-    high = np.max([part.high for part in blocks], axis=0, initial=-np.inf)
+    spans = ((begin, min(rows, begin + block)) for begin in range(0, max(rows, 1), block))
+    blocks = map_in_order(partial(_scan_block, raw, name, channels), spans)
+    bits, missing, unreadable, infinite, lows, highs, filled = zip(*blocks, strict=True)
+    absent, low, high = sum(missing), np.min(lows, axis=0), np.max(highs, axis=0)
     if rows == 0 or absent == rows or not np.any(low <= high):
         raise FormatError(
             f"{', '.join(_source_names(raw))}: none of the {rows} rows holds a number for any "
             "gyro axis; check the columns, the units and --map"
         )
-    axes = [str(axis) for axis in raw["axis"].values]
-    still = [
-        axis
-        for axis, lowest, highest in zip(axes, low, high, strict=True)
-        if lowest == highest and rows - absent > 1
-    ]
-    empty = [
-        axis for axis, lowest, highest in zip(axes, low, high, strict=True) if lowest > highest
-    ]
-    counts = np.sum([part.filled for part in blocks], axis=0, dtype=int).tolist()
+    ranges = list(zip(map(str, raw["axis"].values), low, high, strict=True))
     return ScanPass(
         rows,
-        np.concatenate([part.bits for part in blocks]),
+        np.concatenate(bits),
         absent,
-        merge_spans([part.unreadable for part in blocks]),
-        merge_spans([part.infinite for part in blocks]),
-        still,
-        empty,
-        dict(zip(channels, counts, strict=True)),
+        merge_spans(unreadable),
+        merge_spans(infinite),
+        [axis for axis, least, most in ranges if least == most and rows - absent > 1],
+        [axis for axis, least, most in ranges if least > most],
+        dict(zip(channels, np.sum(filled, axis=0, dtype=int).tolist(), strict=True)),
     )
 
 
 def stamp_blocks(
-    raw: xr.Dataset, scanned: ScanPass, *, block: int = BLOCK_ROWS, all_rows: bool = False
+    raw: xr.Dataset, scanned: ScanPass, *, all_rows: bool = False
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Yield row numbers and stamps [ns] (or `NO_STAMP`) of rows with a sample, in blocks."""
 
     def read_block(begin: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        end = min(scanned.rows, begin + block)
+        end = min(scanned.rows, begin + BLOCK_ROWS)
         values = read_stamps(raw, begin, end)
         if not scanned.repeated and (all_rows or scanned.absent == 0):
             return np.arange(begin, end), values
         keep = scanned.mask(begin, end)
         return np.flatnonzero(keep) + begin, values[keep]
 
-    return map_in_order(read_block, range(0, scanned.rows, block), workers=1)
+    return map_in_order(read_block, range(0, scanned.rows, BLOCK_ROWS), workers=1)
 
 
 def _source_names(raw: xr.Dataset) -> list[str]:

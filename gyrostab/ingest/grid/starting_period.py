@@ -81,7 +81,7 @@ def sample_stretches(stamps: Stamps) -> list[NDArray[np.int64]]:
 _PATTERN = 8  # longest pattern of steps [steps]
 _ROWS = 17  # further rows in which a pattern must recur
 _WHOLE = 0.15  # largest distance of a step of a pattern from whole samples [samples]
-_LONGEST = 5.0  # longest step of a pattern [samples]
+LONGEST = 5.0  # longest step of a pattern [samples]
 
 
 def cut_stretches(parts: list[NDArray[np.int64]], length: int) -> NDArray[np.float64]:
@@ -130,7 +130,7 @@ def finer_period(parts: list[NDArray[np.int64]], period: float) -> float | None:
     recurrences = [
         (counts[:, rows:] == counts[:, :-rows]).all(axis=1) for rows in range(2, _PATTERN + 1)
     ]
-    uneven = (counts.min(axis=1) == 1) & (counts.max(axis=1) > 2) & (counts.max(axis=1) <= _LONGEST)
+    uneven = (counts.min(axis=1) == 1) & (counts.max(axis=1) > 2) & (counts.max(axis=1) <= LONGEST)
     return single if (is_whole & np.any(recurrences, axis=0) & uneven).mean() > 0.5 else None
 
 
@@ -207,7 +207,7 @@ def starting_period(stretches: list[NDArray[np.int64]]) -> tuple[float, bool, bo
     steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
     rising = steps[steps > 0]
     if _has_shared_stamps(parts, steps):
-        return _time_per_row(stretches, ticks=True), True, True
+        return time_per_row(stretches, ticks=True), True, True
     period = period_of_lines(parts)
     if period is None:
         period = _refine_period(steps, float(np.quantile(rising, 0.5, method="lower")))
@@ -215,9 +215,12 @@ def starting_period(stretches: list[NDArray[np.int64]]) -> tuple[float, bool, bo
             rms_misfit(steps, period) > 0.2
         ):  # with most rows missing, the median step is longer than one sample
             shorter = _refine_period(steps, float(np.quantile(rising, 0.1)))
-            period = shorter if rms_misfit(steps, shorter) < 0.15 else period
+            # with random losses a single sample is the most frequent step; stamps in whole
+            # milliseconds are also multiples of a millisecond
+            single = np.argmax(np.bincount(np.rint(rising / shorter).clip(0, 50).astype(int))) == 1
+            period = shorter if single and rms_misfit(steps, shorter) < 0.15 else period
     return (
-        (_time_per_row(stretches), True, False)
+        (time_per_row(stretches), True, False)
         if _is_bursty(parts, steps, period)
         else (period, False, False)
     )
@@ -241,7 +244,7 @@ def _is_bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], perio
     return bool(scatter**2 < 0.2 * length * inliers.var())  # random losses would accumulate
 
 
-def _time_per_row(stretches: list[NDArray[np.int64]], *, ticks: bool = False) -> float:
+def time_per_row(stretches: list[NDArray[np.int64]], *, ticks: bool = False) -> float:
     """Return the mean time per row [ns]; with `ticks`, between changes of a shared stamp.
 
     Rows without a readable stamp count.

@@ -37,7 +37,7 @@ def as_uniform(log: xr.Dataset) -> xr.Dataset:
     xarray keeps attributes through every operation, and tables of gaps through most of them. This
     function trusts neither: the sampling rate comes from ``time``, and the table of gaps is
     clipped, converted or dropped. A log with a computed time axis (see `gyrostab.time.grid`) is
-    uniform and needs no check. Explicit stamps are checked in blocks.
+    uniform and needs no check.
 
     Parameters
     ----------
@@ -108,11 +108,7 @@ def grid_of(log: xr.Dataset, nominal: float | None = None) -> tuple[UniformGrid,
             f"the time of the log is of type {time.dtype}, not dates; give it datetime64 stamps: "
             f"{advise_dates(time.values, 'log') or 'log.assign_coords(time=...)'}"
         )
-
-    def read(begin: int, end: int) -> NDArray[np.int64]:
-        return to_nanoseconds(time[begin:end].values)
-
-    return find_grid(read, size, nominal=nominal), False
+    return find_grid(to_nanoseconds(time.values), nominal=nominal), False
 
 
 def advise_dates(times: NDArray[Any], name: str) -> str:

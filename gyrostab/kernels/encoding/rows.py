@@ -8,7 +8,7 @@ nanoseconds.
 
 from __future__ import annotations
 
-import math
+from fractions import Fraction
 
 import numpy as np
 from numba import njit, types
@@ -33,27 +33,16 @@ _EXACT = np.uint64(1) << np.uint64(53)
 _TENS = 10.0 ** np.arange(23)
 _WHOLE_TENS = np.array([10**n for n in range(20)], dtype=np.uint64)
 _LEAST, _MOST = -60, 40
-_HALF = np.uint64(2**32 - 1)
-_FULL = np.uint64(2**64 - 1)
 _LONGEST_NS = np.uint64(2**63 - 1)
 
 
-def _powers_of_five() -> NDArray[np.uint64]:
-    """Compute the leading 128 bits of the powers of five from `_LEAST` to `_MOST`, in two words."""
-    words = []
-    for power in range(_LEAST, _MOST + 1):
-        if power < 0:
-            five = 5**-power
-            bits = (five - 1).bit_length()
-            value = 2 ** (bits + 127 if power >= -27 else 2 * bits + 128) // five + 1
-        else:
-            value = 5**power << 128
-        value >>= value.bit_length() - 128
-        words.append((value >> 64, value & (2**64 - 1)))
-    return np.array(words, dtype=np.uint64)
+def _powers_of_ten() -> NDArray[np.float64]:
+    """Compute the powers of ten from `_LEAST` to `_MOST`, each as a sum of two doubles."""
+    exact = [Fraction(10) ** power for power in range(_LEAST, _MOST + 1)]
+    return np.array([(float(ten), float(ten - Fraction(float(ten)))) for ten in exact])
 
 
-_FIVES = _powers_of_five()
+_POWERS = _powers_of_ten()
 
 
 @njit(types.CPointer(types.uint8)(types.CPointer(types.uint8)), **KERNEL)
@@ -63,55 +52,36 @@ def _as_pointer(text):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _multiply_words(a, b):  # type: ignore[no-untyped-def]
-    """Multiply two words: high and low word."""
-    half = np.uint64(32)
-    a0, a1, b0, b1 = a & _HALF, a >> half, b & _HALF, b >> half
-    low = a0 * b0
-    middle = a1 * b0 + (low >> half)
-    cross = a0 * b1 + (middle & _HALF)
-    return a1 * b1 + (middle >> half) + (cross >> half), (cross << half) | (low & _HALF)
+def _split_double(value):  # type: ignore[no-untyped-def]
+    """Split a double into two of 26 bits, so that products of parts are exact."""
+    scaled = value * (2.0**27 + 1.0)
+    high = scaled - (scaled - value)
+    return high, value - high
 
 
 @njit(**INNER)
 def _nearest_double(mantissa, power):  # type: ignore[no-untyped-def]
-    """Find the double nearest to ``mantissa * 10**power``, if the method of Lemire finds it.
+    """Find the double nearest to ``mantissa * 10**power``, unless it is nearly between two.
 
-    Lemire, Software: Practice and Experience 51 (2021).
+    The product of Dekker, Numerische Mathematik 18 (1971), with twice the digits of a double.
     """
     if mantissa == np.uint64(0):
         return 0.0, True
     if power < _LEAST or power > _MOST:
         return 0.0, False
+    value = np.float64(mantissa)
     if mantissa <= _EXACT and abs(power) < len(_TENS):
-        return (mantissa / _TENS[-power], True) if power < 0 else (mantissa * _TENS[power], True)
-    shifted = np.int64(0)
-    while not mantissa >> np.uint64(63):
-        mantissa <<= np.uint64(1)
-        shifted += 1
-    high, low = _multiply_words(mantissa, _FIVES[power - _LEAST, 0])
-    if high & np.uint64(0x1FF) == np.uint64(0x1FF):
-        more, _ = _multiply_words(mantissa, _FIVES[power - _LEAST, 1])
-        low += more
-        if more > low:
-            high += np.uint64(1)
-    if low == _FULL and power < -27:
-        return 0.0, False
-    top = np.int64(high >> np.uint64(63))
-    shift = np.uint64(top + 9)
-    significand = high >> shift
-    if (
-        low <= np.uint64(1)
-        and -4 <= power <= 23
-        and significand & np.uint64(3) == np.uint64(1)
-        and significand << shift == high
-    ):
-        significand &= ~np.uint64(1)
-    significand += significand & np.uint64(1)
-    significand >>= np.uint64(1)
-    return math.ldexp(
-        np.float64(significand), ((217706 * power) >> 16) + 63 + top - shifted - 52
-    ), True
+        return (value / _TENS[-power], True) if power < 0 else (value * _TENS[power], True)
+    rest = np.float64(np.int64(mantissa - np.uint64(value)))
+    ten, ten_rest = _POWERS[power - _LEAST]
+    product = value * ten
+    (a, b), (c, d) = _split_double(value), _split_double(ten)
+    low = ((a * c - product) + a * d + b * c) + b * d + (value * ten_rest + rest * ten)
+    nearest = product + low
+    left = low - (nearest - product)
+    doubt = abs(nearest) * 2.0**-98
+    is_sure = nearest + (left - doubt) == nearest and nearest + (left + doubt) == nearest
+    return nearest, is_sure
 
 
 @njit(**INNER)

@@ -23,7 +23,7 @@ _MOST = 64
 #: a loss; a loss of k samples is k times less likely than that of one. A row that has no sample on
 #: the grid is as unlikely as 1e-13,
 #: much more than an outlier: rows that are late by many samples for a while are kept.
-_OUTLIER_NATS, _LOSS_NATS, _DROP_NATS = 12.5, 5.0, 30.0
+_OUTLIER_NATS, LOSS_NATS, _DROP_NATS = 12.5, 5.0, 30.0
 #: Standard deviations within which the end of a loss is looked for.
 _REACH_SIGMA = 2.5
 #: Cost of 1000 consecutive outliers; more late rows are not outliers, but follow a loss.
@@ -61,10 +61,10 @@ def _keep_hypothesis(table, n, level, phase, cost, parent):  # type: ignore[no-u
 
 
 @njit(**INNER)
-def _switch_nats(jump):  # type: ignore[no-untyped-def]
+def _switch_nats(jump, loss_nats):  # type: ignore[no-untyped-def]
     """Compute the cost of going `jump` samples ahead (a loss), or back (rows without a sample)."""
     if jump > 0:
-        return _LOSS_NATS + np.log(jump)
+        return loss_nats + np.log(jump)
     return min(-_DROP_NATS * jump, _LATE_NATS)
 
 
@@ -76,7 +76,7 @@ def _stamp_nats(off, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _prune_hypotheses(table, n):  # type: ignore[no-untyped-def]
+def _prune_hypotheses(table, n, loss_nats):  # type: ignore[no-untyped-def]
     """Drop hypotheses that the best one can still reach at less cost; returns the number left."""
     best = np.int64(0)
     for h in range(n):
@@ -86,7 +86,7 @@ def _prune_hypotheses(table, n):  # type: ignore[no-untyped-def]
     size = np.int64(0)
     for h in range(n):
         jump = table[h, 0] - level
-        if jump == 0.0 or table[h, 2] < cost + _switch_nats(jump):
+        if jump == 0.0 or table[h, 2] < cost + _switch_nats(jump, loss_nats):
             for c in range(4):
                 table[size, c] = table[h, c]
             size += 1
@@ -94,7 +94,9 @@ def _prune_hypotheses(table, n):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _extend_hypothesis(new, size, old, h, position, following, sigma, gain, hold, max_lost):  # type: ignore[no-untyped-def]
+def _extend_hypothesis(  # type: ignore[no-untyped-def]
+    new, size, old, h, position, following, sigma, gain, hold, max_lost, loss_nats
+):
     """Add the successors of hypothesis h for a row at `position`, and the next at `following`."""
     level, phase, cost = old[h, 0], old[h, 1], old[h, 2]
     weight = 0.5 / sigma**2
@@ -110,13 +112,13 @@ def _extend_hypothesis(new, size, old, h, position, following, sigma, gain, hold
     while jump >= low:  # a loss whose end this row may be, or a row too many
         if jump > 0.0 or (jump < 0.0 and jump == np.rint(off)):
             residual = off - jump
-            dear = cost + _switch_nats(jump) + _stamp_nats(residual, weight)
+            dear = cost + _switch_nats(jump, loss_nats) + _stamp_nats(residual, weight)
             size = _keep_hypothesis(new, size, level + jump, phase + gain * residual, dear, h)
         jump -= 1.0
     ahead = np.rint(following - level - phase)
     # a loss of which the next row shows the end
     if 1.0 <= ahead <= max_lost and abs(ahead - off) > _REACH_SIGMA * sigma + 0.5:
-        dear = cost + _switch_nats(ahead) + _stamp_nats(off - ahead, weight)
+        dear = cost + _switch_nats(ahead, loss_nats) + _stamp_nats(off - ahead, weight)
         size = _keep_hypothesis(new, size, level + ahead, phase, dear, h)
     return size
 
@@ -131,7 +133,7 @@ def _seed_hypotheses(table, level, phase, first, max_lost):  # type: ignore[no-u
             size = _keep_hypothesis(table, size, level - lost, phase, 0.0, np.int64(0))
         if np.rint(first - phase) <= max_lost:
             size = _keep_hypothesis(
-                table, size, np.rint(first - phase), phase, _LOSS_NATS, np.int64(0)
+                table, size, np.rint(first - phase), phase, LOSS_NATS, np.int64(0)
             )  # or many, just after the first
     return size
 
@@ -147,6 +149,7 @@ def trace(  # type: ignore[no-untyped-def]
     gain,
     hold,
     max_lost,
+    loss_nats,
     level0,
     phase0,
     averaged_rows,
@@ -174,6 +177,8 @@ def trace(  # type: ignore[no-untyped-def]
     max_lost : float
         Samples that may be lost at one time: damaged stamps far ahead are outliers, and not the end
         of a loss.
+    loss_nats : float
+        Cost of a loss of one sample [nats].
     level0, phase0 : int, float
         Samples lost so far, and phase of the clock [samples].
     averaged_rows : int
@@ -205,9 +210,19 @@ def trace(  # type: ignore[no-untyped-def]
         new_size = np.int64(0)
         for h in range(size):
             new_size = _extend_hypothesis(
-                new, new_size, old, h, position, following, sigma, follows, hold, max_lost
+                new,
+                new_size,
+                old,
+                h,
+                position,
+                following,
+                sigma,
+                follows,
+                hold,
+                max_lost,
+                loss_nats,
             )
-        size = _prune_hypotheses(new, new_size) if new_size > 1 else new_size
+        size = _prune_hypotheses(new, new_size, loss_nats) if new_size > 1 else new_size
         for h in range(size):
             table[i, h, 0], table[i, h, 1], parents[i, h] = new[h, 0], new[h, 1], np.int8(new[h, 3])
         old, new = new, old
@@ -294,7 +309,7 @@ def find_phase(count, stamps, period, sigma):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def follow(count, stamps, period, sigma, gain, longest, block):  # type: ignore[no-untyped-def]
+def follow(count, stamps, period, sigma, gain, longest, loss_nats, block):  # type: ignore[no-untyped-def]
     """Count the samples along noisy stamps, as `track` of `stamps` does along exact ones.
 
     Parameters
@@ -309,6 +324,8 @@ def follow(count, stamps, period, sigma, gain, longest, block):  # type: ignore[
         As for `trace`.
     longest : float
         A longer step starts a new piece [ns].
+    loss_nats : float
+        As for `trace`.
     block : int
         Rows traced at one time, at most.
 
@@ -334,7 +351,7 @@ def follow(count, stamps, period, sigma, gain, longest, block):  # type: ignore[
         level = sample[begin:end]
         total += trace(
             count[begin:end], stamps[begin:end], count[begin], stamps[begin], period, sigma, gain,
-            np.inf, longest / period,
+            np.inf, longest / period, loss_nats,
             np.int64(0), phase, np.int64(0), level, off[begin:end],
         )  # fmt: skip
         for i in range(begin, end):

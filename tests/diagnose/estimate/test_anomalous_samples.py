@@ -57,6 +57,7 @@ def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -
             marks=pytest.mark.full,
         ),
         ({"name": "held_samples", "per_hour": 60.0, "length": 0.4, "fill": "zero"}, {"axes": "x"}),
+        ({"name": "dead_zone", "width": 0.2, "centre": 0.3, "axes": ["x"]}, {"mean": 0.5}),
         ({"name": "clipping", "limit": 0.6, "axes": ["y"]}, {"axes": "y"}),
         pytest.param(
             {"name": "clipping", "limit": 1.75, "axes": ["y"]}, {}, marks=pytest.mark.slow
@@ -69,7 +70,7 @@ def test_stuck_samples_are_identified(table, options):
     (identification,) = identifications.identified
     assert identification.effect == table["name"]
     assert identification.axes == tuple(table.get("axes", options.get("axes", "xyz")))
-    is_exclusive = table["name"] == "dead_zone" and options
+    is_exclusive = table["name"] == "dead_zone" and options.get("axes") == "x"
     assert identification.alternatives == (("held_samples",) if is_exclusive else ())
     if table["name"] == "held_samples":
         (fitted,) = fit_identifications(
@@ -77,6 +78,12 @@ def test_stuck_samples_are_identified(table, options):
         )[:1]
         assert fitted.effect is not None
         assert fitted.effect.fill == table.get("fill", "repeat")
+    if "centre" in table:
+        baseline = calibrate_noise(identifications.state.blocks)
+        (fitted,) = fit_identifications(identifications, baseline)[:1]
+        assert fitted.effect is not None
+        assert fitted.effect.centre == table["centre"]
+        assert fitted.effect.width == pytest.approx(table["width"], rel=0.1)
 
 
 @pytest.mark.slow

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
-from gyrostab.diagnose.estimate.constant_rate import constant_rates, noise_lost_by_truncation
+from gyrostab.diagnose.estimate.constant_rate import constant_rates, undo_noise_loss
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
@@ -45,10 +47,34 @@ def test_rounded_values_have_the_constant_rate_and_noise_of_those_before(mode, n
     error = 5.0 * scatter / np.sqrt(9000.0)
     assert constant_rates(blocks, effects)["x"] == pytest.approx(-3.0, abs=error)
     assert constant_rates(blocks, effects)["y"] == pytest.approx(0.4, abs=error)
-    lost = noise_lost_by_truncation(blocks, effects)
+    after = float(blocks["variance"].sel(axis="y").mean()) - 1.0 / 12.0
+    recorded = {"y": {"N": math.sqrt(after / (HOUR * 10.0)), "B": 0.0, "K": 0.0}}
+    undone = undo_noise_loss(recorded, blocks.sel(axis=["y"]), effects)
     if mode == "round":
-        assert not lost
+        assert undone == recorded
         return
-    variance = float(blocks["variance"].sel(axis="y").mean())
-    assert variance - 1.0 / 12.0 < 0.97 * scatter**2
-    assert variance - 1.0 / 12.0 + lost["y"] == pytest.approx(scatter**2, rel=0.08)
+    assert after < 0.97 * scatter**2
+    assert undone["y"]["N"] == pytest.approx(noise, rel=0.04)
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        {"name": "clipping", "limit": 0.5, "centre": 0.4},
+        {"name": "clipping", "limit": 0.8},
+        {"name": "dead_zone", "width": 0.4, "centre": 0.4},
+        {"name": "dead_zone", "width": 0.4, "centre": 0.7},
+        {"name": "dead_zone", "width": 0.6, "edge": "jump"},
+    ],
+    ids=lambda table: "-".join(map(str, table.values())),
+)
+def test_noise_and_rate_are_those_before_a_limit_or_a_dead_zone(table):
+    blocks = reduce_simulation(table | {"axes": ["y"]}).sel(axis=["y"])
+    after = float(blocks["variance"].mean())
+    recorded = {"y": {"N": math.sqrt(after / (HOUR * 10.0)), "B": 0.01, "K": 0.0}}
+    effect = make_effect(table)
+    undone = undo_noise_loss(recorded, blocks, [effect])["y"]
+    assert recorded["y"]["N"] < 0.93 * 0.003 or table.get("edge") == "jump"
+    assert undone["N"] == pytest.approx(0.003, rel=0.03)
+    assert undone["B"] > 0.0105
+    assert constant_rates(blocks, [effect])["y"] == pytest.approx(0.4, abs=0.05)

@@ -47,6 +47,22 @@ def test_anomalous_samples_are_counted_in_their_blocks():
     assert int(clipped.repeats.sum()) == 0  # at the ends
 
 
+@pytest.mark.parametrize("step", [0.0, 0.02, 0.3])
+def test_samples_at_one_rate_are_stuck_and_held_ones_are_not(step):
+    rng = np.random.default_rng(11)
+    x = 5.0 + rng.standard_normal((2, 60 * 1000))
+    inside = np.abs(x[0] - 5.4) < 0.4
+    x[0, inside] = 5.4
+    for first in rng.integers(1, 60 * 998, 12):
+        x[1, first : first + 30] = x[1, first - 1]
+    x = np.rint(x / step) * step if step else x
+    blocks = reduce_log(log_of(x), block="10s")
+    assert blocks.zone_centre.values[0] == pytest.approx(5.4)
+    assert np.isnan(blocks.zone_centre.values[1])
+    assert int(blocks.stuck[0].sum()) == pytest.approx(inside.sum(), rel=0.1)
+    assert int(blocks.stuck[1].sum()) == 0
+
+
 def test_zeros_of_one_axis_are_stuck_and_common_zeros_are_filled():
     rng = np.random.default_rng(10)
     x = rng.standard_normal((3, 60 * 1000))

@@ -21,7 +21,7 @@ from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.ingest.reading import read_log
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import check_log
-from tests.support.raw_rows import START, expected, raw_log, stamps_of
+from tests.support.raw_rows import START, expected, raw_log, regularise_in_parts, stamps_of
 
 RATES = [99.3, 300.0, 1 / 7, 248.7, 100.0021]
 
@@ -112,7 +112,7 @@ def test_block_and_chunk_sizes_do_not_matter(pattern, block):
     _, _, stamps, _ = pattern
     stamps = np.concatenate([stamps, stamps[:200]])
     raw = raw_log(stamps, temperature=np.where(np.arange(len(stamps)) % 7, np.nan, 20.0))
-    whole, parts = regularise(raw), regularise(raw, block=block, chunk=97)
+    whole, parts = regularise(raw), regularise_in_parts(raw, block=block, chunk=97)
     for log in (whole, parts):
         del log.attrs["history"]
     xr.testing.assert_identical(whole, parts)
@@ -130,7 +130,7 @@ def test_lazy_arrays_equal_those_in_memory(chunk, monkeypatch):
     truth[:, samples] = values
     monkeypatch.setattr(sys.modules["gyrostab.ingest.grid.fill"], "MAX_PLAIN_NUMBERS", 10)
     for signal in (values, da.from_array(values, chunks=(1, 247))):
-        log = regularise(raw.assign(rate=raw.rate.copy(data=signal)), chunk=chunk)
+        log = regularise_in_parts(raw.assign(rate=raw.rate.copy(data=signal)), chunk=chunk)
         assert isinstance(log.rate.data, da.Array)
         np.testing.assert_array_equal(log.rate.values, truth)
         np.testing.assert_array_equal(log.rate[:, 8800:12_200].values, truth[:, 8800:12_200])
@@ -331,10 +331,8 @@ def test_unusable_logs_are_errors():
         regularise(raw_log(np.full(100, np.iinfo(np.int64).min)))
     for wrong in (
         {"rate": -1.0},
-        {"tolerance": 0.7},
         {"max_gap": "soon"},
         {"max_gap": 0},
-        {"chunk": 0},
     ):
         with pytest.raises(OptionError):
             regularise(raw_log(stamps_of(np.arange(10), 100.0)), **wrong)
@@ -352,8 +350,6 @@ def test_a_regular_log_passes_through():
     assert regularise(log, rate=100.0) is log
     with pytest.raises(OptionError, match=r"tool.csv is a regular log of 100 Hz, not of 200 Hz"):
         regularise(log, rate=200.0)
-    with pytest.raises(OptionError, match="tolerance=7"):
-        regularise(log, tolerance=7)
 
 
 def test_arrays_keep_every_bit():
@@ -368,7 +364,6 @@ def test_rows_of_a_single_run_are_returned_unchanged():
     placement = place_by_stamp(
         lambda: iter([(np.arange(50), stamps_of(np.arange(50), 10.0))]),
         10.0,
-        tolerance=0.25,
         max_gap=1e9,
         where="x",
     )

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gyrostab.errors import TimeError
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
-from tests.support.raw_rows import START, raw_log, stamps_of
+from tests.support.raw_rows import START, raw_log, regularise_in_parts, stamps_of
 from tests.support.stamp_scatter import (
     JITTER,
     LOSSES,
@@ -27,7 +27,7 @@ def place(jitter, scatter, losses, unit, *, rate=100.0, rows=20_000, seed=0, **o
     """Regularise scattered stamps; return the log, true samples and placed samples of its rows."""
     random = np.random.default_rng(seed)
     samples = lose_samples(losses, rows, random)
-    log = regularise(
+    log = regularise_in_parts(
         raw_log(round_stamps(scatter_stamps(samples, jitter, scatter, random), rate, unit)),
         **options,
     )

@@ -38,7 +38,7 @@ def test_no_drift_over_200_hours(rate):
 
     estimate = estimate_rate(stamps, where="long.csv")
     assert estimate.rate == rate
-    placement = place_by_stamp(stamps, rate, tolerance=0.25, max_gap=1e9, where="long.csv")
+    placement = place_by_stamp(stamps, rate, max_gap=1e9, where="long.csv")
     assert placement.size == last + 1
     assert np.all(placement.runs[:, 0] == placement.runs[:, 1])  # row numbers equal true samples
     exact = START + round(last * Fraction(10**9) / Fraction(repr(rate)))
@@ -202,9 +202,6 @@ def test_recurring_steps_give_the_rate_of_the_unit_step_and_a_note_on_the_other(
 @pytest.mark.parametrize(
     "stamps",
     [
-        stamps_of(
-            2 * np.arange(6000) + np.random.default_rng(6).integers(0, 2, 6000), 10.0
-        ),  # each on time, or late by 0.1 s
         START
         + np.floor(np.arange(6000) * 1e3 / 700.0).astype(np.int64)
         * 1_000_000,  # 700 Hz, written to the millisecond
@@ -212,13 +209,77 @@ def test_recurring_steps_give_the_rate_of_the_unit_step_and_a_note_on_the_other(
         stamps_of(
             np.flatnonzero(np.random.default_rng(7).random(6000) > 0.4), 100.0
         ),  # two of five lost, at random
-        stamps_of(
-            np.flatnonzero(np.resize([1, 1, 0], 6000)) / 1.5, 100.0
-        ),  # even for a clock that ticks twice in three samples
     ],
 )
 def test_even_samples_have_no_recurring_steps(stamps):
-    assert not any("recur" in note for note in regularise(raw_log(stamps)).attrs["notes"])
+    notes = " ".join(regularise(raw_log(stamps)).attrs["notes"])
+    assert "recur" not in notes
+    assert "as if rows" not in notes
+
+
+@pytest.mark.parametrize(
+    ("samples", "rate", "even"),
+    [
+        # each on time, or late by 0.1 s
+        (2 * np.arange(6000) + np.random.default_rng(6).integers(0, 2, 6000), 10.0, 5.0),
+        # even for a clock that ticks twice in three samples
+        (np.flatnonzero(np.resize([1, 1, 0], 6000)), 150.0, 100.0),
+        # one in five lost, with jitter
+        (
+            np.flatnonzero(np.resize([1, 1, 1, 1, 0], 6000))
+            + np.random.default_rng(8).normal(0.0, 0.1, 4800),
+            50.0,
+            40.0,
+        ),
+    ],
+)
+def test_even_samples_that_may_be_a_finer_grid_with_losses_are_noted(samples, rate, even):
+    log = regularise(raw_log(stamps_of(samples, rate)))
+    assert log.attrs["sampling_rate_hz"] == pytest.approx(even, rel=1e-6)
+    (note,) = (note for note in log.attrs["notes"] if "as if rows" in note)
+    assert note.endswith(f"give --rate {rate:g}")
+    log = regularise(raw_log(stamps_of(samples, rate)), rate=rate)
+    assert log.sizes["time"] == pytest.approx(np.ptp(samples) + 1, abs=1)
+
+
+def lose_samples(kind, share, rows, random):
+    """Return the samples that are left of `rows`: single losses, or bursts of 20 on average."""
+    if kind == "single":
+        return np.flatnonzero(random.random(rows) >= share)
+    begins = np.cumsum(random.geometric(1 / 20, (rows, 2)) * [(1 - share) / share, 1], dtype=int)
+    pairs = np.diff(begins.ravel(), prepend=0)
+    return np.flatnonzero(np.repeat(np.arange(pairs.size) % 2 == 0, pairs)[:rows])
+
+
+@pytest.mark.parametrize(
+    ("kind", "share", "jitter", "unit"),
+    [
+        ("single", 0.5, 0.2, 1),
+        ("single", 0.6, 0.2, 1000),
+        ("single", 0.8, 0.1, 1000),
+        ("single", 0.3, 0.3, 100_000),
+        ("bursts", 0.8, 0.2, 1_000_000),
+        ("bursts", 0.4, 0.3, 1_000_000),
+    ],
+)
+def test_random_losses_with_jitter_do_not_change_the_rate(kind, share, jitter, unit):
+    random = np.random.default_rng(9)
+    samples = lose_samples(kind, share, 20_000, random)
+    stamps = stamps_of(samples + random.normal(0.0, jitter, samples.size), 400.0)
+    log = regularise(raw_log(stamps // unit * unit))
+    assert log.attrs["sampling_rate_hz"] == pytest.approx(400.0, rel=1e-5)
+    assert abs(log.sizes["time"] - np.ptp(samples) - 1) <= 1
+
+
+def test_rows_lost_among_shared_stamps_make_no_rows_of_the_tick():
+    random = np.random.default_rng(3)
+    samples = lose_samples("single", 0.4, 2000, random)
+    stamps = stamps_of(samples, 400.0) // 10_000_000 * 10_000_000
+    log = regularise(raw_log(stamps))
+    assert log.attrs["sampling_rate_hz"] == pytest.approx(240.0, rel=0.05)
+    assert any("may be higher: give it with --rate" in note for note in log.attrs["notes"])
+    log = regularise(raw_log(stamps), rate=400.0)
+    assert log.sizes["time"] == pytest.approx(2000, abs=3)
 
 
 def test_multiple_of_the_rate_is_not_accepted():

@@ -8,7 +8,7 @@ import pytest
 from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
-from tests.support.raw_rows import START, raw_log, stamps_of
+from tests.support.raw_rows import START, raw_log, regularise_in_parts, stamps_of
 
 
 def test_long_step_is_a_step_of_the_clock_unless_allowed():
@@ -41,7 +41,8 @@ REPEATED = {
 def test_repeated_rows_are_duplicates(rows, block):
     samples = np.r_[0:1200, 1300:3100, 3101:6101]  # with gaps, which the repetitions have too
     values = np.random.default_rng(1).standard_normal(6000)
-    log = regularise(raw_log(stamps_of(samples, 300.0)[rows], values[rows]), block=block)
+    raw = raw_log(stamps_of(samples, 300.0)[rows], values[rows])
+    log = regularise_in_parts(raw, block=block)
     once = regularise(raw_log(stamps_of(samples, 300.0), values))
     assert np.array_equal(log.rate.values, once.rate.values, equal_nan=True)
     assert np.array_equal(log.time.values, once.time.values)
