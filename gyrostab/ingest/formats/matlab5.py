@@ -104,6 +104,12 @@ class _Elements:
         kind, data = self._take()
         return np.frombuffer(data, self.order + _TYPES[kind])
 
+    def _take_number(self) -> int:
+        numbers = self._take_array()
+        if not numbers.size:
+            raise ValueError("an element without its number")
+        return int(numbers[0])
+
     def find_numbers(self, field: str, objects: list[str]) -> Arrays:
         """Yield the array that consists of these elements, or those in the fields of a structure.
 
@@ -111,7 +117,7 @@ class _Elements:
         """
         if not self.data:
             return  # an empty array within a structure
-        flags = int(self._take_array()[0])
+        flags = self._take_number()
         array, is_complex = flags & 0xFF, bool(flags & 0x800)
         if array not in _CLASSES:
             raise ValueError(f"there is no array of class {array}")
@@ -130,7 +136,7 @@ class _Elements:
 
     def _find_members(self, name: str, count: int, objects: list[str]) -> Arrays:
         """Yield the arrays in the fields of a structure, or scalars of many structures as one."""
-        length, names = int(self._take_array()[0]), bytes(self._take()[1])
+        length, names = self._take_number(), bytes(self._take()[1])
         if length <= 0 or len(names) % length or count * len(names) // length > len(self.data):
             raise ValueError("the names of the fields of a structure are damaged")
         parts = (names[at : at + length] for at in range(0, len(names), length))
