@@ -37,7 +37,7 @@ SHARED_NUMBERS = {
 HOMES = ("units.py", "noise.py")
 WHOLE_SECONDS = {
     "time/durations.py": "names of lengths of time in whole seconds",
-    "time/grid.py": "calendar arithmetic in whole seconds, where a float loses nanoseconds",
+    "time/stamps.py": "calendar arithmetic in whole seconds, where a float loses nanoseconds",
     "ingest/columns/stamps.py": "whole nanoseconds of a time unit",
     "ingest/formats/las.py": "hours, minutes and seconds of a clock reading",
 }
