@@ -174,7 +174,7 @@ def fit_filter_response(
     block means. A fit without the filter would take the steep slope for B and K, and the floor of
     the stopped bands for N.
 
-    All axes pass the one logger: None if the noise terms alone describe some axis better.
+    All axes pass the one logger: None if the noise terms alone describe some axis about as well.
     """
     responses = [
         band_response(LoggerFilter.example(**values), blocks)
@@ -183,7 +183,7 @@ def fit_filter_response(
     behind = [[fit_behind(fit, fit.columns * response) for fit in fits] for response in responses]
     chosen = choose_filter(behind, settings)
     is_better = [
-        nats > fit_behind(fit, fit.columns)[0]
+        nats > fit_behind(fit, fit.columns)[0] + settings.ambiguous_nats
         for fit, (nats, _) in zip(fits, behind[chosen], strict=True)
     ]
     return responses[chosen] if all(is_better) else None
