@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
-from gyrostab.diagnose.baseline.known_effects import expect_known_motion
+from gyrostab.diagnose.baseline.known_effects import expect_known_motion, filtered_blocks
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.estimate.conditioned_baseline import expected_baseline, without_expected
 from gyrostab.diagnose.estimate.forms import settle_forms
@@ -163,12 +163,15 @@ def _reduce_recording(task: Task, block: Any) -> tuple[Task, xr.Dataset]:
 def _calibrate_baseline(task: Task, blocks: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """Step 2: return the blocks in which the model does not move the rate, and the baseline."""
     task.progress("calibrating", 0)
+    if not isinstance(task.simulation, Model):
+        return blocks, _make_baseline(task, blocks)
+    blocks = filtered_blocks(blocks, task.simulation)
     baseline = _make_baseline(task, blocks)
-    if isinstance(task.simulation, Model):
-        moving = expect_known_motion(blocks, baseline, settings=task.settings)
-        if moving.any():
-            blocks = _at_rest(task, blocks, moving).drop_vars("moving")  # the model has the motion
-            baseline = _make_baseline(task, blocks)
+    moving = expect_known_motion(blocks, baseline, settings=task.settings)
+    if moving.any():
+        at_rest = _at_rest(task, blocks, moving).drop_vars("moving")  # the model has the motion
+        blocks = filtered_blocks(at_rest, task.simulation)
+        baseline = _make_baseline(task, blocks)
     return blocks, baseline
 
 

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.calibrate import assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, common_variance, line_columns
 from gyrostab.diagnose.baseline.known_effects import expect_known_effects
-from gyrostab.diagnose.baseline.known_lines import independent_line_share
+from gyrostab.diagnose.baseline.known_lines import average_in_bands, independent_line_share
 from gyrostab.diagnose.baseline.posterior import DRAWS, Posterior
 from gyrostab.diagnose.baseline.quiescent import find_quiescent_spans, given_quiescent_blocks
+from gyrostab.diagnose.evidence.spectral_lines import interpolate_bands
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError, SchemaError
@@ -100,12 +101,32 @@ def baseline_from_model(
     )
     out["mean_variance"] *= effects.white_share
     out = out.assign(label_variables(effects.variables, BASELINE))
-    if "peaks" in out:
-        noise = np.stack([line_columns(blocks) @ posterior.square for posterior in posteriors])
-        out["shape_alone"] *= independent_line_share(noise + out["peaks"].values, blocks)[:, None]
+    if "line_noise" in out or "peaks" in out:
+        _describe_lines(out, blocks, np.stack([posterior.square for posterior in posteriors]))
     out["coefficient"].loc[{"term": "R"}] = ramp
     out["stderr"].loc[{"term": list(TERMS) if given_blocks is None else ["R"]}] = 0.0
     return out
+
+
+def _describe_lines(baseline: xr.Dataset, blocks: xr.Dataset, square: Array) -> None:
+    """Add what filters and resonances do to the lines of a band to the baseline.
+
+    Where the lines of a resonance dominate, the power of the band has fewer degrees of freedom.
+    """
+    density = np.stack([line_columns(blocks) @ axis_square for axis_square in square])
+    if "line_noise" in baseline:
+        density = baseline["line_noise"].values
+        smooth = interpolate_bands(
+            average_in_bands(density, blocks),
+            blocks["line_frequency"].values,
+            blocks["frequency"].values,
+        )
+        baseline["line_shape"] = baseline["line_noise"].copy(data=density / smooth)
+    if "peaks" in baseline:
+        share = independent_line_share(density + baseline["peaks"].values, blocks)
+        if "line_noise" in baseline:  # the blocks have the share of the filter
+            share = share / independent_line_share(density, blocks)
+        baseline["shape_alone"] *= share[:, None]
 
 
 def scale_to_quiescent(

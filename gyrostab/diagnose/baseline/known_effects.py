@@ -11,8 +11,14 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.expected_statistics import NOISE, band_columns
-from gyrostab.diagnose.baseline.known_lines import average_in_bands, expect_lines, resonance_density
+from gyrostab.diagnose.baseline.expected_statistics import NOISE, band_columns, line_columns
+from gyrostab.diagnose.baseline.known_lines import (
+    average_in_bands,
+    expect_lines,
+    independent_line_share,
+    line_factors,
+    resonance_density,
+)
 from gyrostab.diagnose.baseline.sample_transfer import undo_transfer
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import (
@@ -65,10 +71,7 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
     narrow: list[tuple[Effect, list[int], Array]] = []
     coherent: list[tuple[NDArray[np.complex128], Array]] = []
     left_out = []
-    for effect in model.effects:
-        if isinstance(effect, LoggerFilter):  # it runs at the rate of the instrument
-            effect = replace(effect, instrument=float(model.log.get("oversampling", 1)))
-        rows = [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes]
+    for effect, rows in _effects_on_rows(model, axes):
         of_effect = tuple(axes[row] for row in rows)
         sizes = partial(effect.expand_to_axes, axes=of_effect)
         prediction = predict_effect(effect, blocks, of_effect)
@@ -97,10 +100,53 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
     noise = np.einsum("fn,afn,abn->abf", band_columns(blocks), response, np.maximum(squares, 0.0))
     spectrum = spread_by_gaps((noise + added * white_response) * left[..., None], blocks)
     variables = _shared_cross(coherent, white_response, blocks)
+    if (response != 1.0).any() and "line_power" in blocks:
+        variables["line_noise"] = _filtered_lines(model, square, blocks)
     if narrow and "line_power" in blocks:
         variables |= expect_lines(blocks, narrow, white_response[:, 0])
     white_share = 1.0 - random.power / spectrum[..., 0]
     return KnownEffects(mean, spectrum, white_share, variables | random.variables(), left_out)
+
+
+def _effects_on_rows(model: Model, axes: list[str]) -> Iterator[tuple[Effect, list[int]]]:
+    """Yield the effects of a model, each with the rows of the axes that it acts on."""
+    for effect in model.effects:
+        if isinstance(effect, LoggerFilter):  # it runs at the rate of the instrument
+            effect = replace(effect, instrument=float(model.log.get("oversampling", 1)))
+        yield (
+            effect,
+            [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes],
+        )
+
+
+def _filtered_lines(model: Model, square: Array, blocks: xr.Dataset) -> Array:
+    """Return the density of the noise behind filters at full resolution, (axis, line)."""
+    axes = [str(axis) for axis in blocks["axis"].values]
+    columns = line_columns(blocks)
+    factor = np.ones((len(axes), *columns.shape))
+    for effect, rows in _effects_on_rows(model, axes):
+        if isinstance(effect, LoggerFilter):
+            factor[rows] *= line_factors(effect, blocks)
+    return np.asarray(np.einsum("lt,alt,at->al", columns, factor, square))
+
+
+def filtered_blocks(blocks: xr.Dataset, model: Model) -> xr.Dataset:
+    """Return blocks with the degrees of freedom that powers have behind the filters of a model.
+
+    Where some lines of a band dominate, its power has those of fewer lines.
+    """
+    if "line_power" not in blocks or not any(
+        isinstance(effect, LoggerFilter) for effect in model.effects
+    ):
+        return blocks
+    axes = map(str, blocks["axis"].values)
+    square = np.array([[model.coefficients(axis)[term] ** 2 for term in NOISE] for axis in axes])
+    share = independent_line_share(_filtered_lines(model, square, blocks), blocks)[:, None]
+    shapes = {"shape": blocks["shape"] * share}
+    if "cross_shape" in blocks:
+        first, second = pair_indices(blocks)
+        shapes["cross_shape"] = blocks["cross_shape"] * np.sqrt(share[first] * share[second])
+    return blocks.assign(shapes)
 
 
 def _share_left(effect: Effect, model: Model, rows: list[int], blocks: xr.Dataset) -> Array:

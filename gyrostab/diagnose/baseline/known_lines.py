@@ -11,16 +11,19 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
+from gyrostab.diagnose.predict.filter_response import filter_factors
 from gyrostab.diagnose.predict.linear_model import unspread_share
 from gyrostab.diagnose.predict.windows import complex_factors, predict_effect
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
+from gyrostab.noise import sampled_psd
 from gyrostab.physics.base import Effect
 
 Array = NDArray[np.float64]
 _LEAK_LINES = 100  # on either side, that a line leaks into; limits time
 _PLACES_BETWEEN = 4  # positions of a line on either side of a frequency of the spectrum
+_FINER = 2 * _PLACES_BETWEEN
 _PEAK_POINTS = 1000  # within a step of a density
 
 
@@ -84,9 +87,7 @@ def resonance_density(
     if not math.isfinite(getattr(effect, "quality", math.inf)) or "line_frequency" not in blocks:
         return None
     frequency = blocks["line_frequency"].values
-    finer = 2 * _PLACES_BETWEEN
-    size = int(blocks.attrs["block_samples"])
-    fine = frequency[0] / finer * np.arange(1, finer * frequency.size + 1)
+    fine = _between_lines(frequency)
     prediction = predict_effect(effect, blocks, axes, fine)
     density = prediction.spectrum[name].reshape(-1, fine.size)[0].copy()
     line = prediction.line
@@ -97,13 +98,41 @@ def resonance_density(
         frequencies = fine[place] + (fine[1] - fine[0]) * inside
         finest = predict_effect(effect, blocks, axes, frequencies).spectrum[name]
         density[place] = finest.reshape(-1, inside.size)[0].mean()
-    window = np.abs(np.fft.fft(taper(size), size * finer)) ** 2
-    reach = min(_LEAK_LINES, frequency.size // 2) * finer
+    return _average_over_taper(density, int(blocks.attrs["block_samples"]))
+
+
+def line_factors(effect: Effect, blocks: xr.Dataset) -> NDArray[Any]:
+    """Return the factor (line, term) of a filter on the tapered density of Q, N, B and K."""
+    frequency, rate = blocks["line_frequency"].values, float(blocks.attrs["sampling_rate_hz"])
+    fine = _between_lines(frequency)
+    at_lines = slice(_FINER - 1, None, _FINER)
+    factors = []
+    for symbol, factor in filter_factors(effect, blocks, fine).items():
+        if symbol in "QN":  # the filter leaves less of some lines than others leak into them
+            density = sampled_psd(symbol, fine, rate)
+            tapered = _average_over_taper(density * factor, int(blocks.attrs["block_samples"]))
+            factors.append(tapered / density[at_lines])
+        else:
+            factors.append(factor[at_lines])
+    return np.stack(factors, axis=-1)
+
+
+def _between_lines(frequency: Array) -> Array:
+    """Return frequencies up to the highest one, `_FINER` for each line."""
+    return np.asarray(frequency[0] / _FINER * np.arange(1, _FINER * frequency.size + 1))
+
+
+def _average_over_taper(density: Array, size: int) -> Array:
+    """Return the density that the lines of a tapered block of `size` samples have.
+
+    The density is at the frequencies of `_between_lines`.
+    """
+    window = np.abs(np.fft.fft(taper(size), size * _FINER)) ** 2
+    reach = min(_LEAK_LINES * _FINER, density.size // 2)
     window = np.concatenate([window[-reach:], window[: reach + 1]])
-    tapered = np.convolve(
-        np.concatenate([density[::-1], density[:1], density]), window / window.sum(), "same"
-    )
-    return np.asarray(tapered[fine.size + finer :: finer])
+    around = np.concatenate([density[::-1], density[:1], density, density[::-1]])
+    tapered = np.convolve(around, window / window.sum(), "same")
+    return np.asarray(tapered[density.size + _FINER : 2 * density.size + 1 : _FINER])
 
 
 def _take_leakage(lines: NDArray[Any]) -> NDArray[Any]:
@@ -133,10 +162,9 @@ def _line_leakage(size: int, apart: float = 0.0) -> tuple[Array, Array, Array]:
     """
     weights = taper(size)
     reach = min(_LEAK_LINES, (ordinates(size) - 1) // 2)
-    finer = 2 * _PLACES_BETWEEN
     turned = weights * np.exp(2j * np.pi * apart * np.arange(size) / size)
-    padded = np.abs(np.fft.fft(turned, size * finer)) ** 2 / (size * (weights**2).sum())
-    place = np.arange(-reach, reach + 1) * finer
+    padded = np.abs(np.fft.fft(turned, size * _FINER)) ** 2 / (size * (weights**2).sum())
+    place = np.arange(-reach, reach + 1) * _FINER
     inside = padded[place[:, None] + np.arange(-_PLACES_BETWEEN, _PLACES_BETWEEN + 1)]
     ends = np.array([0.5, *[1.0] * (2 * _PLACES_BETWEEN - 1), 0.5])
     return inside[:, _PLACES_BETWEEN], np.average(inside, axis=1, weights=ends), inside.max(axis=1)

@@ -21,15 +21,20 @@ _MAX_SKIRT_LINES = 40  # design choice
 def expected_lines(baseline: xr.Dataset, frequency: Array) -> Array:
     """Return the expected density (axis, line) at frequencies [Hz], without known steady lines."""
     spectrum = baseline["spectrum"].mean("block").values
-    bands = np.log(baseline["frequency"].values)
     if "line_spectrum" in baseline:
         spectrum = np.maximum(
             spectrum - baseline["line_spectrum"].values, _MIN_LEVEL_RATIO * spectrum
         )
-    smooth = np.stack(
-        [np.exp(np.interp(np.log(frequency), bands, np.log(row))) for row in spectrum]
-    )
+    smooth = interpolate_bands(spectrum, frequency, baseline["frequency"].values)
+    if "line_shape" in baseline:
+        smooth = smooth * baseline["line_shape"].values
     return smooth + baseline["peaks"].values if "peaks" in baseline else smooth
+
+
+def interpolate_bands(values: Array, frequency: Array, bands: Array) -> Array:
+    """Interpolate positive values (axis, band) at frequencies (axis, line), as powers of both."""
+    places, centres = np.log(frequency), np.log(bands)
+    return np.stack([np.exp(np.interp(places, centres, np.log(row))) for row in values])
 
 
 def line_evidence(power: Array, weight: Array, expected: Array | None = None) -> Array:

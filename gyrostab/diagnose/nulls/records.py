@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import line_columns, white_variance
 from gyrostab.diagnose.evidence.sample_counts import kurtosis_moments
+from gyrostab.diagnose.evidence.spectral_lines import interpolate_bands
 from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.nulls.shared_noise import (
     SharedNoise,
@@ -125,15 +126,14 @@ def _prepare_nulls(
     rate = float(blocks.attrs["sampling_rate_hz"])
     half_difference = 1.0 - np.cos(2.0 * np.pi * blocks["line_frequency"].values / rate)
     sd = []
-    for square in baseline["square"].values:
-        density = lines @ square
-        variances = density.mean() * rate, 2.0 * ((density * half_difference).mean() * rate)
+    density = lines * baseline["square"].values[:, None]  # (axis, line, term)
+    if "line_noise" in baseline:  # a filter leaves no rounding apart
+        density = np.stack([np.zeros(density.shape[:2]), baseline["line_noise"].values], axis=-1)
+    for total in density.sum(axis=-1):
+        variances = total.mean() * rate, 2.0 * ((total * half_difference).mean() * rate)
         sd.append(np.sqrt(variances))
-    peaks = baseline["peaks"].values if "peaks" in baseline else np.zeros((len(sd), len(lines)))
-    density = [
-        np.column_stack([lines * square, peak])
-        for square, peak in zip(baseline["square"].values, peaks, strict=True)
-    ]
+    if "peaks" in baseline:
+        density = np.concatenate([density, baseline["peaks"].values[..., None]], axis=-1)
     tails = np.array([_kurtosis_excess(blocks, axis_density, rng) for axis_density in density])
     ties = _common_shapes(baseline["shape_alone"].values, int(blocks.attrs["block_samples"]))
     shared = find_shared_noise(blocks, baseline)
@@ -317,7 +317,7 @@ def _draw_lines(setup: _NullSetup, squares: Array, rng: np.random.Generator) -> 
     part_count, n = weight.shape[1], blocks.sizes["block"]
     part_of = np.arange(n) * part_count // n
     neighbours = blocks["neighbours"].values
-    frequency, bands = np.log(blocks["line_frequency"].values), np.log(blocks["frequency"].values)
+    frequency, bands = blocks["line_frequency"].values, blocks["frequency"].values
     plain = squares @ line_columns(blocks).T
     flat = plain.mean(axis=-1, keepdims=True)
     out = np.full((*plain.shape[:2], part_count, plain.shape[2]), np.nan)
@@ -331,7 +331,9 @@ def _draw_lines(setup: _NullSetup, squares: Array, rng: np.random.Generator) -> 
             columns = baseline["columns"].values[axis, chosen]
             noise = (columns @ baseline["square"].values[axis]).mean(axis=0)
             over = np.maximum(over - baseline["line_spectrum"].values[axis] / noise, 0.01 * over)
-        effects = np.interp(frequency, bands, over)
+        effects = interpolate_bands(over[None], frequency, bands)[0]
+        if "line_shape" in baseline:
+            effects = effects * baseline["line_shape"].values[axis]
         out[:, axis, part] = (share * plain[:, axis] + (1.0 - share) * flat[:, axis]) * effects
         if "peaks" in baseline:
             out[:, axis, part] += baseline["peaks"].values[axis]

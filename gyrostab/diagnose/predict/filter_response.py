@@ -48,7 +48,7 @@ def band_response(effect: Effect, blocks: xr.Dataset) -> Array:
     """
     frequency, rate = frequencies_in_bands(blocks), float(blocks.attrs["sampling_rate_hz"])
     factors = []
-    for symbol, response in _responses_at(effect, blocks, frequency).items():
+    for symbol, response in filter_factors(effect, blocks, frequency).items():
         power = sampled_psd(symbol, frequency, rate)
         passed = _split_into_bands(power * response).mean(axis=1)
         factors.append(passed / _split_into_bands(power).mean(axis=1))
@@ -68,7 +68,7 @@ def band_shape_factor(effect: Effect, blocks: xr.Dataset) -> Array:
 
     Lines of unequal power have fewer degrees of freedom together than equal ones.
     """
-    response = _split_into_bands(_responses_at(effect, blocks, frequencies_in_bands(blocks))["N"])
+    response = _split_into_bands(filter_factors(effect, blocks, frequencies_in_bands(blocks))["N"])
     return np.asarray(response.mean(axis=1) ** 2 / (response**2).mean(axis=1))
 
 
@@ -77,7 +77,7 @@ def _split_into_bands(values: Array) -> Array:
     return values.reshape(-1, FREQUENCIES_PER_BAND)
 
 
-def _responses_at(effect: Effect, blocks: xr.Dataset, frequency: Array) -> Mapping[str, Array]:
+def filter_factors(effect: Effect, blocks: xr.Dataset, frequency: Array) -> Mapping[str, Array]:
     """Return the factors of a filter at frequencies, by noise term."""
     return effect.explain(replace(make_windows(blocks, {}), frequency=frequency)).response
 
@@ -98,7 +98,7 @@ def undo_filter(
         Density without the filter, up to a factor.
     """
     frequency = blocks["line_frequency"].values
-    full = _responses_at(effects()[effect].example(**values), blocks, frequency)["N"]
+    full = filter_factors(effects()[effect].example(**values), blocks, frequency)["N"]
     weight = axis_values(blocks, "line_weight", axis)
     power = axis_values(blocks, "line_power", axis)
     good = (weight > 0) & np.isfinite(power).all(axis=1)

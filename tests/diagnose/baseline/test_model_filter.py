@@ -7,6 +7,7 @@ import pytest
 
 import gyrostab
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
+from gyrostab.diagnose.evidence.spectral_lines import expected_lines, mean_line_power
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
 
@@ -36,10 +37,25 @@ def made(**filtering: float) -> dict[str, object]:
 def test_a_model_expects_its_own_filter(filtering):
     model = made(**filtering)
     blocks = reduce_log(simulate(model, duration="1h", rate=10.0, seed=3).compute())
-    expected = baseline_from_model(blocks, model)["spectrum"]
-    ratio = (blocks["power"] / expected).mean(["axis", "block"]).values
+    baseline = baseline_from_model(blocks, model)
+    ratio = (blocks["power"] / baseline["spectrum"]).mean(["axis", "block"]).values
     error = 1.0 / np.sqrt(blocks["shape"].sum(["axis", "block"]).values)
     assert np.abs((ratio - 1.0) / error).max() < 4.5
+    powers, expected = [], expected_lines(baseline, blocks["line_frequency"].values)
+    for axis in "xy":
+        power, count = mean_line_power(blocks, axis)
+        powers.append(power)
+    ratio = (powers / expected).mean(axis=0)[2:]  # there the mean of the block is taken out
+    assert np.abs(ratio - 1.0).max() < 5.0 / np.sqrt(2.0 * count)
+
+
+@pytest.mark.parametrize("filtering", [{"cutoff": 2.0}, {"length": 0.5}], ids=str)
+@pytest.mark.usefixtures("one_thread")
+def test_a_recording_does_not_differ_from_its_own_filter(filtering):
+    model = made(**filtering)
+    log = simulate(model, duration="30min", rate=10.0, seed=4).compute()
+    diagnosis = gyrostab.diagnose(log, simulation=model, nulls=100)
+    assert diagnosis.verdict == "no mismatch"
 
 
 @pytest.mark.slow
