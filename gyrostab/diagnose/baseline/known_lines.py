@@ -23,7 +23,7 @@ from gyrostab.physics.base import Effect
 Array = NDArray[np.float64]
 _LEAK_LINES = 100  # on either side, that a line leaks into; limits time
 _PLACES_BETWEEN = 4  # positions of a line on either side of a frequency of the spectrum
-_FINER = 2 * _PLACES_BETWEEN
+_FINER = 2 * _PLACES_BETWEEN  # frequencies for each line
 _PEAK_POINTS = 1000  # within a step of a density
 
 

@@ -12,9 +12,9 @@ from scipy.special import ndtri
 Array = NDArray[np.float64]
 _NORMAL = ndtri((np.arange(1001) + 0.5) / 1001)  # equally likely values
 _NORMAL /= _NORMAL.std()
-_MAX_MEANS = 200  # of blocks, or of equal groups of blocks with similar means
-_ROUNDS = 100
-_MIN_SHARE = 1e-3  # of a variance that is left
+_MAX_MEANS = 200  # of blocks, or of equal groups of blocks with similar means; limits time
+_ROUNDS = 100  # of a fixed-point iteration; limits time
+_MIN_SHARE = 1e-3  # of a variance that is left; a power of zero has no likelihood
 
 
 class PassedNoise(NamedTuple):

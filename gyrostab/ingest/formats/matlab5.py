@@ -81,7 +81,7 @@ class _Elements:
     def __init__(self, data: bytes | memoryview, order: str):
         self.data, self.order, self.place = memoryview(data), order, 0
 
-    def _take(self) -> tuple[int, memoryview]:
+    def _take_element(self) -> tuple[int, memoryview]:
         """Take type and bytes of the next element; raise an error if it is cut off."""
         word = struct.unpack_from(self.order + "I", self.data, self.place)[0]
         if word >> 16:  # a small element holds its data in the tag
@@ -98,10 +98,10 @@ class _Elements:
         return kind, self.data[begin : begin + length]
 
     def _take_text(self) -> str:
-        return bytes(self._take()[1]).decode("latin-1")
+        return bytes(self._take_element()[1]).decode("latin-1")
 
     def _take_array(self) -> NDArray[Any]:
-        kind, data = self._take()
+        kind, data = self._take_element()
         return np.frombuffer(data, self.order + _TYPES[kind])
 
     def _take_number(self) -> int:
@@ -136,7 +136,7 @@ class _Elements:
 
     def _find_members(self, name: str, count: int, objects: list[str]) -> Arrays:
         """Yield the arrays in the fields of a structure, or scalars of many structures as one."""
-        length, names = self._take_number(), bytes(self._take()[1])
+        length, names = self._take_number(), bytes(self._take_element()[1])
         if length <= 0 or len(names) % length or count * len(names) // length > len(self.data):
             raise ValueError("the names of the fields of a structure are damaged")
         parts = (names[at : at + length] for at in range(0, len(names), length))
@@ -144,7 +144,7 @@ class _Elements:
         columns: dict[str, list[list[NDArray[Any]]]] = {field: [] for field in fields}
         for _ in range(count):
             for field in fields:
-                kind, data = self._take()
+                kind, data = self._take_element()
                 if kind != _MATRIX:
                     raise ValueError("a member of a structure is not an array")
                 arrays = _Elements(data, self.order).find_numbers(

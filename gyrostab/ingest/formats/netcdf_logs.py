@@ -55,14 +55,14 @@ def open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
     if path.is_dir() and content != "log":
         stored = stored[sorted(stored.variables, key=str)]  # as the order in a folder is arbitrary
     try:
-        return _open(path, stored)
+        return _open_regular(path, stored)
     except TimeError:
         if content == "log":
             raise
         return None  # its rows are placed by their stamps, like those of other files
 
 
-def _open(path: Path, stored: xr.Dataset) -> xr.Dataset:
+def _open_regular(path: Path, stored: xr.Dataset) -> xr.Dataset:
     try:
         log = as_uniform(from_disk(stored, path.name))
     except (SchemaError, TimeError) as error:
@@ -82,7 +82,7 @@ def _open_remote(path: Path, url: str) -> xr.Dataset:
             ", not a log of gyrostab; open it with xarray and give it to gyrostab.davar, or copy "
             "it here and use gyrostab ingest"
         )
-    return _open(path, stored)
+    return _open_regular(path, stored)
 
 
 def _is_regular(path: Path) -> bool:

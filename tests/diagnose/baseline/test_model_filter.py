@@ -60,6 +60,23 @@ def test_a_recording_does_not_differ_from_its_own_filter(filtering):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
+def test_aliases_of_white_noise_are_not_taken_for_bias_instability():
+    log = simulate(
+        made(cutoff=58.0, order=1.0, pick=1.0, oversampling=16),
+        duration="15min",
+        rate=100.0,
+        seed=5,
+    ).compute()
+    diagnosis = gyrostab.diagnose(log, nulls=100)
+    (effect,) = diagnosis.effects
+    assert effect["parameters"]["cutoff"]["value"] == pytest.approx(58.0, rel=0.05)
+    for axis in "xy":
+        assert diagnosis.model["noise"][axis]["N"] == pytest.approx(NOISE["N"], rel=0.1)
+        assert diagnosis.model["noise"][axis]["B"] < 4.0 * NOISE["B"]  # 14 times, without aliases
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("one_thread")
 def test_a_named_filter_of_a_fast_instrument_simulates_the_recording():
     log = simulate(
         made(cutoff=6.0, order=4.0, oversampling=16), duration="30min", rate=10.0, seed=5
