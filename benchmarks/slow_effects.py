@@ -45,6 +45,7 @@ def ladder(name: str, strength: float, number: int) -> list[float]:
         "kind": "single",
         "names": [name],
         "strengths": [strength],
+        "in_fitted_noise": False,
     }
     log, truth = make_case(plan | {"gaps": 0.0, "cuts": 0, "heavy": False, "degradation": None})
     reduced = reduce_log(log)

@@ -20,6 +20,7 @@ from gyrostab.blindtest.generator.detection_limits import (
     NATS_PER_SAMPLE,
     amplitude_for,
     filtered_density,
+    fitted_nats,
     learned_filter_nats,
     learned_nats,
     learned_random_nats,
@@ -61,6 +62,7 @@ def small(
         "kind": "single" if name else "null",
         "names": names,
         "strengths": [strength] * len(names),
+        "in_fitted_noise": False,
     }
     return base | {"rate": rate, "seconds": seconds, "gaps": 0.1, "degradation": None} | more
 
@@ -546,14 +548,12 @@ def test_degraded_driver(how):
 def test_composition_of_a_benchmark():
     plans = plan_cases(400, seed=5)
     kinds = [plan["kind"] for plan in plans]
-    assert kinds.count("null") == 100
-    assert (
-        kinds.count("out_of_catalogue")
-        == kinds.count("degraded_driver")
-        == kinds.count("sub_threshold")
-        == 40
-    )
-    assert (kinds.count("pair"), kinds.count("triple")) == (60, 20)
+    assert kinds.count("null") == kinds.count("sub_threshold") == 40
+    assert kinds.count("out_of_catalogue") == kinds.count("degraded_driver") == 60
+    assert (kinds.count("pair"), kinds.count("triple")) == (80, 20)
+    strong = [plan["kind"] for plan in plans if plan["in_fitted_noise"]]
+    assert not {"null", "sub_threshold"} & set(strong)
+    assert 0.4 < strong.count("pair") / 80 < 0.6
     assert {len(plan["names"]) for plan in plans if plan["kind"] == "triple"} == {3}
     assert all(len(set(plan["names"])) == len(plan["names"]) for plan in plans)
     single = [plan["names"][0] for plan in plans if plan["kind"] == "single"]
@@ -565,6 +565,22 @@ def test_composition_of_a_benchmark():
     assert max(gaps) > 0.35
     assert 0.4 < np.mean(np.array(gaps) == 0) < 0.6
     assert plan_case(17, seed=5) == plans[17]
+
+
+@pytest.mark.parametrize("name", ["temperature_bias", "gauss_markov", "spectral_line"])
+def test_strength_in_fitted_noise_is_reached(name):
+    scenario = white_scenario(seconds=1200)
+
+    def make(**options):
+        return CATALOGUE[name].make(scenario, stream(3, name), strength=3.0, **options)
+
+    known, strong = make(), make(in_fitted_noise=True)
+    reached = math.sqrt(fitted_nats(scenario, strong) / NATS)
+    assert known.strength == 3.0 <= strong.strength
+    assert reached >= 3.0 or strong.strength == 24.0
+    assert strong.form == known.form  # only the size differs
+    if name == "spectral_line":
+        assert strong.strength < 3.1
 
 
 def test_a_third_of_the_forms_differ_from_those_fitted():

@@ -176,8 +176,9 @@ def test_size_of_an_injection_refers_to_the_noise_of_the_recording():
         0.5 * float((fft.dct(row - row.mean(), norm="ortho")[1:] ** 2 / RATE / density).sum())
         for row in mean
     )
-    assert math.sqrt(nats / NATS) == pytest.approx(6.0, rel=0.3)
-    assert truth["effects"][0]["size"] == 6.0
+    strength = truth["effects"][0]["strength"]
+    assert math.sqrt(nats / NATS) == pytest.approx(strength, rel=0.3)
+    assert truth["effects"][0]["size"] == strength
 
 
 def test_injected_shared_source_has_its_signs_and_axes():
@@ -234,5 +235,5 @@ def test_truth_of_an_injection_has_the_axes_of_the_log() -> None:
 
 def test_half_of_the_injections_have_the_strength_from_which_most_should_be_named() -> None:
     strengths = [plan["strength"] for plan in plan_injections(400, seed=3)[::4]]
-    assert set(strengths) == {2.5, 5.0, 8.0}
+    assert set(strengths) == {3.0, 5.0, 8.0}
     assert 0.4 < strengths.count(5.0) / len(strengths) < 0.6

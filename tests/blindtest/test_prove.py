@@ -51,7 +51,7 @@ def small_plans(number: int, *, seed: int) -> list[dict]:
         plans.append(
             plan_case(index, seed=seed)
             | SMALL
-            | {"kind": kind, "names": names, "strengths": strengths}
+            | {"kind": kind, "names": names, "strengths": strengths, "in_fitted_noise": False}
         )
     return plans
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -15,8 +17,13 @@ from gyrostab.blindtest.generator import (
     thermal,
     wander,
 )
+from gyrostab.blindtest.generator.detection_limits import NATS, fitted_nats
 from gyrostab.blindtest.generator.record import UNITS
 from gyrostab.blindtest.generator.scenario import Effect, Scenario
+
+_ROUNDS = 6  # to raise a strength in fitted noise, which is roughly proportional to the strength
+_MARGIN = 1.02  # of the strength above that proportion
+_MAX_FACTOR = 8.0  # of the strength in known noise over the one in fitted noise
 
 
 @dataclass(frozen=True)
@@ -39,10 +46,28 @@ class Entry:
         """Driver that is a channel of the log."""
         return self.driver if self.driver in UNITS else None
 
-    def make(self, scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
-        """Draw the effect."""
+    def make(
+        self,
+        scenario: Scenario,
+        rng: np.random.Generator,
+        *,
+        strength: float,
+        in_fitted_noise: bool = False,
+    ) -> Effect:
+        """Draw the effect at a strength in known noise, or at least at this one in fitted noise.
+
+        Its strength in known noise is at most `_MAX_FACTOR` times larger: a filter of a quantized
+        angle, for instance, may be invisible in fitted noise at any strength.
+        """
+        start, raised = copy.deepcopy(rng), strength
         effect = self.draw(scenario, rng, strength=strength)
-        return replace(effect, name=self.draw.__name__, driver=self.driver)
+        for _ in range(_ROUNDS if in_fitted_noise else 0):
+            reached = math.sqrt(fitted_nats(scenario, effect) / NATS) / strength
+            if reached >= 1 or raised >= _MAX_FACTOR * strength:
+                break
+            raised = min(_MARGIN * raised / max(reached, 1 / _MAX_FACTOR), _MAX_FACTOR * strength)
+            effect = self.draw(scenario, copy.deepcopy(start), strength=raised)
+        return replace(effect, name=self.draw.__name__, driver=self.driver, strength=raised)
 
 
 def _by_name(*entries: Entry) -> dict[str, Entry]:

@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 
 from gyrostab.blindtest.generator.measured_noise import BANDS
 from gyrostab.blindtest.generator.noise_floor import floor_psd, white_level
-from gyrostab.blindtest.generator.scenario import Scenario, count_per_second
+from gyrostab.blindtest.generator.scenario import Effect, Scenario, count_per_second
 from gyrostab.errors import OptionError
 
 Array = NDArray[np.float64]
@@ -115,6 +115,14 @@ def learned_nats(scenario: Scenario, mean: Array) -> float:
         _divergence_from_noise(scenario, axis, f, power)
         for axis, f, power in _mean_spectra(scenario, mean)
     )
+
+
+def fitted_nats(scenario: Scenario, effect: Effect) -> float:
+    """Return the evidence expected for an effect over noise fitted without it [nats]."""
+    learned = effect.learned_nats
+    if learned is None and effect.mean is not None:
+        learned = learned_nats(scenario, effect.mean)
+    return float(effect.nats if learned is None else min(effect.nats, learned))
 
 
 def learned_random_nats(

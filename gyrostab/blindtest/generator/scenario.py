@@ -69,13 +69,14 @@ class Scenario:
 class Effect:
     """Contribution of one effect to the record, and its ground truth.
 
-    The catalogue sets `name` and `driver`. `mean` (axis, time) [deg/h] is added; `variance` (axis,
-    second) multiplies the white noise; `extra` (axis, time) [deg/h] is added noise; `common` (axis,
-    time), shared by the axes, replaces as much of their white noise, in units of it; `after` is
-    applied to the finished record; `size` is in units of the closed-form limit; `nats` is the
-    evidence expected with the truth known, and `learned_nats` over fitted noise where `mean` is not
-    known, but random; `form_differs` is set where the diagnosis fits another form; `also_accepted`
-    holds further names that are right for this case.
+    The catalogue sets `name`, `driver` and `strength`. `mean` (axis, time) [deg/h] is added;
+    `variance` (axis, second) multiplies the white noise; `extra` (axis, time) [deg/h] is added
+    noise; `common` (axis, time), shared by the axes, replaces as much of their white noise, in
+    units of it; `after` is applied to the finished record. In units of the closed-form limit,
+    `strength` is the size asked for, and `size` the one drawn. `nats` is the evidence expected with
+    the truth known, and `learned_nats` over fitted noise where `mean` is not known, but random;
+    `form_differs` is set where the diagnosis fits another form; `also_accepted` holds further names
+    that are right for this case.
     """
 
     axes: tuple[str, ...]
@@ -86,6 +87,7 @@ class Effect:
     tau: tuple[float, float]
     name: str = ""
     driver: str | None = None
+    strength: float = 0.0
     learned_nats: float | None = None
     active: NDArray[np.bool_] | None = None
     mean: Array | None = None

@@ -33,7 +33,7 @@ RunStep = Callable[..., list[Any]]
 
 _DEFAULTS = {"cases": 40, "nulls": 400, "counterparts": 4}
 
-_CASES_PER_INJECTION = 40  # each injection makes four more cases
+_CASES_PER_INJECTION = 20  # each injection makes four more cases
 
 
 class Proof(NamedTuple):
@@ -89,7 +89,7 @@ def prove(
     workers : int
         Number of processes: one per core by default, 0 to work in this process.
     real : path-like
-        Folder of real recordings; one injection is made for every 40 cases. Without it there are no
+        Folder of real recordings; one injection is made for every 20 cases. Without it there are no
         injections. See `gyrostab.blindtest.scenarios.real`.
     resume : bool
         Continue an interrupted run in the folder, or start one.

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _COLUMNS = 5
-_POOL_LIMITS = (1.5, 4.0)  # detection is not required below the first
 _LABELS = {
     "detected": "detected",
     "named": "named correctly (or unidentified, if out of catalogue)",
@@ -22,8 +21,7 @@ _LABELS = {
 def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
     """Plot shares detected and named against strength, one panel per effect, with intervals.
 
-    Similar strengths of one effect are pooled because each has few cases; the first panel shows all
-    effects.
+    The first panel shows all effects.
     """
     from gyrostab.plot import new_figure, save_png
 
@@ -34,11 +32,7 @@ def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
     for place, panel in enumerate(panels.flat):
         if place < len(names):
             part = curves[curves["effect"] == names[place]]
-            _draw_panel(
-                panel,
-                part if names[place] == "all" else _pool_strengths(part),
-                names[place].replace("_", " "),
-            )
+            _draw_panel(panel, part, names[place].replace("_", " "))
         else:
             panel.set_axis_off()
     figure.supxlabel("strength, in units of the closed-form limit")
@@ -51,28 +45,6 @@ def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
             frameon=False,
         )
     return lambda target: save_png(figure, target, colours=64)
-
-
-def _pool_strengths(part: pd.DataFrame) -> pd.DataFrame:
-    """Pool strengths of one effect between limits at their weighted geometric mean."""
-    import numpy as np
-    import pandas as pd
-
-    from gyrostab.blindtest.scoring.proportions import wilson
-
-    out = []
-    for _, group in part.groupby(np.digitize(part["strength"], _POOL_LIMITS)):
-        number = int(group["n"].sum())
-        line: dict[str, Any] = {
-            "strength": float(np.exp(np.average(np.log(group["strength"]), weights=group["n"]))),
-            "n": number,
-        }
-        for key in ("detected", "named"):
-            hits = round(float((group[key] * group["n"]).sum()))
-            low, high = wilson(hits, number)
-            line |= {key: hits / number, f"{key}_low": low, f"{key}_high": high}
-        out.append(line)
-    return pd.DataFrame(out)
 
 
 def _draw_panel(panel: Axes, part: pd.DataFrame, title: str) -> None:
@@ -94,7 +66,7 @@ def _draw_panel(panel: Axes, part: pd.DataFrame, title: str) -> None:
         )
     panel.set_title(f"{title} ({int(part['n'].sum())})", fontsize="small")
     panel.set_xscale("log", base=2)
-    panel.set_xticks([0.5, 1, 2, 4, 8], ["0.5", "1", "2", "4", "8"])
+    panel.set_xticks([0.5, 1, 2, 4, 8, 16, 32], ["0.5", "1", "2", "4", "8", "16", "32"])
     panel.set_ylim(-0.05, 1.05)
     panel.axvline(1.5, color="#8c8c8c", linewidth=0.7, linestyle=":")
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gyrostab.blindtest.generator import environment, telemetry
 from gyrostab.blindtest.generator.catalogue import CATALOGUE, OUT_OF_CATALOGUE, Entry
-from gyrostab.blindtest.generator.detection_limits import learned_nats
+from gyrostab.blindtest.generator.detection_limits import fitted_nats
 from gyrostab.blindtest.generator.record import find_missing, make_channels, make_log, make_record
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, draw_scenario, stream
 from gyrostab.blindtest.scenarios.drivers import degrade_driver
@@ -99,6 +99,7 @@ def draw_effects(plan: dict[str, Any], scenario: Scenario, *, attempt: int = 0) 
             scenario,
             stream(plan["seed"], "effect", plan["index"], attempt, name),
             strength=strength,
+            in_fitted_noise=plan["in_fitted_noise"],
         )
         for name, strength in zip(plan["names"], plan["strengths"], strict=True)
     ]
@@ -131,7 +132,8 @@ def make_case(plan: dict[str, Any]) -> tuple[xr.Dataset, dict[str, Any]]:
     --------
     >>> from gyrostab.blindtest.scenarios.plan import plan_case
     >>> plan = plan_case(0, seed=5) | {"rate": 10.0, "seconds": 600, "kind": "single"}
-    >>> log, truth = make_case(plan | {"names": ["ageing_noise"], "strengths": [4.0]})
+    >>> plan |= {"names": ["ageing_noise"], "strengths": [4.0], "in_fitted_noise": False}
+    >>> log, truth = make_case(plan)
     >>> truth["effects"][0]["name"], log.sizes["time"]
     ('ageing_noise', 6000)
     """
@@ -164,14 +166,13 @@ def make_case(plan: dict[str, Any]) -> tuple[xr.Dataset, dict[str, Any]]:
         channels = degrade_driver(
             channels, str(driver), how=plan["degradation"], rng=stream(seed, "degradation", attempt)
         )
-    strengths = plan["strengths"]
     if plan.get("copy") == "counterpart":
         missing = find_missing(scenario, effects)
-        scenario, effects, strengths = replace(scenario, missing=missing), [], []
+        scenario, effects = replace(scenario, missing=missing), []
         record = make_record(scenario, effects, seed=seed + attempt)
         plan = plan | {"kind": "counterpart"}
     log = make_log(record, channels, start=scenario.start, rate=scenario.rate)
-    truth = describe_truth(scenario, effects, strengths=strengths) | {
+    truth = describe_truth(scenario, effects) | {
         "plan": plan,
         "visibility": visibility,
         "attempts": attempt + 1,
@@ -203,14 +204,7 @@ def _block_means(scenario: Scenario, values: NDArray[np.float64]) -> list[float]
     return [float(f"{value:.6g}") for value in np.nanmean(padded, axis=1)]
 
 
-def _learned_nats(scenario: Scenario, effect: Effect) -> float:
-    learned = effect.learned_nats
-    if learned is None and effect.mean is not None:
-        learned = learned_nats(scenario, effect.mean)
-    return float(effect.nats if learned is None else min(effect.nats, learned))
-
-
-def _describe_effect(scenario: Scenario, effect: Effect, strength: float) -> dict[str, Any]:
+def _describe_effect(scenario: Scenario, effect: Effect) -> dict[str, Any]:
     waveform = {}
     if effect.mean is not None:
         waveform = {
@@ -224,10 +218,10 @@ def _describe_effect(scenario: Scenario, effect: Effect, strength: float) -> dic
         "driver": effect.driver,
         "form": effect.form,
         "form_differs": bool(effect.form_differs),
-        "strength": float(strength),
+        "strength": float(effect.strength),
         "size": float(effect.size),
         "expected_nats": float(effect.nats),
-        "learned_nats": _learned_nats(scenario, effect),
+        "learned_nats": fitted_nats(scenario, effect),
         "tau_min_s": float(effect.tau[0]),
         "tau_max_s": float(effect.tau[1]),
         "localised": effect.active is not None,
@@ -237,16 +231,11 @@ def _describe_effect(scenario: Scenario, effect: Effect, strength: float) -> dic
     }
 
 
-def describe_truth(
-    scenario: Scenario, effects: Sequence[Effect], *, strengths: Sequence[float]
-) -> dict[str, Any]:
+def describe_truth(scenario: Scenario, effects: Sequence[Effect]) -> dict[str, Any]:
     """Describe the ground truth of a case, ready for JSON."""
     return {
         "schema": "gyrostab.blindtest/2",
-        "effects": [
-            _describe_effect(scenario, effect, strength)
-            for effect, strength in zip(effects, strengths, strict=True)
-        ],
+        "effects": [_describe_effect(scenario, effect) for effect in effects],
         "accepted": sorted({name for effect in effects for name in effect.also_accepted}),
         "in_catalogue": all(effect.name in CATALOGUE for effect in effects),
         "noise": {axis: dict(noise) for axis, noise in zip(AXES, scenario.noise, strict=True)},

@@ -165,7 +165,7 @@ def inject_effect(
     effect : str
         Name in the catalogue.
     strength : float
-        Size in units of the closed-form limit for the noise of this log, as measured by
+        Size in units of the limit in fitted noise, for the noise of this log as measured by
         `gyrostab.blindtest.generator.measured_noise`.
 
     Returns
@@ -211,8 +211,7 @@ def inject_effect(
     }
     names = dict(zip(AXES, axes, strict=False))
     truth, control_truth = (
-        _rename_axes(describe_truth(scenario, effects, strengths=[strength] * len(effects)), names)
-        for effects in ([made], [])
+        _rename_axes(describe_truth(scenario, effects), names) for effects in ([made], [])
     )
     copies = {
         "injected": injected,
@@ -268,7 +267,7 @@ def _draw_effect(
         scenario = _draw_around_log(log, record, measured, rng)
         if entry.needs == "rotation" and scenario.rotation.max() == 0:
             continue
-        made = entry.make(scenario, rng, strength=strength)
+        made = entry.make(scenario, rng, strength=strength, in_fitted_noise=True)
         if set(made.axes) <= present or (len(made.axes) == 3 and made.after is not None):
             return scenario, made
     raise OptionError(

@@ -14,17 +14,24 @@ from gyrostab.errors import OptionError
 #: Kind of case -> its number in 20 cases. "single", "sub_threshold", "out_of_catalogue" and
 #: "degraded_driver" hold one effect.
 KINDS = {
-    "null": 5,
+    "null": 2,
     "single": 5,
     "sub_threshold": 2,
-    "pair": 3,
+    "pair": 4,
     "triple": 1,
-    "out_of_catalogue": 2,
-    "degraded_driver": 2,
+    "out_of_catalogue": 3,
+    "degraded_driver": 3,
 }
 
-#: Sizes in units of the closed-form limit.
+#: Sizes in units of the closed-form limit in known noise, for half of the cases.
 STRENGTHS = (0.5, 1.0, 1.5, 2.5, 4.0, 8.0)
+
+#: Least sizes in units of the limit in fitted noise, for the other half: three times the limit and
+#: more are required to be detected and named, and few effects of `STRENGTHS` reach that.
+STRONG_IN_FITTED_NOISE = (3.0, 5.0, 8.0)
+
+#: Kinds of which all cases have sizes in known noise: their effects are to be invisible in a plot.
+_NEVER_STRONG = ("null", "sub_threshold")
 
 #: Degradations of the channel that drives an effect; see `degrade_driver`.
 DEGRADATIONS = ("withheld", "substituted", "lagged", "confounded", "noisy", "clipped")
@@ -95,8 +102,9 @@ def plan_case(index: int, *, seed: int) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``index``, ``seed``, ``kind``, ``names``, ``strengths``, ``rate`` [Hz], ``seconds``,
-        ``gaps`` (share), ``cuts``, ``heavy``, ``degradation``.
+        ``index``, ``seed``, ``kind``, ``names``, ``strengths``, ``in_fitted_noise`` (whether the
+        strengths are), ``rate`` [Hz], ``seconds``, ``gaps`` (share), ``cuts``, ``heavy``,
+        ``degradation``.
 
     Raises
     ------
@@ -107,7 +115,7 @@ def plan_case(index: int, *, seed: int) -> dict[str, Any]:
     --------
     >>> kinds = [plan_case(i, seed=1)["kind"] for i in range(40)]
     >>> kinds.count("null")
-    10
+    4
     """
     if index < 0:
         raise OptionError(f"index={index}: cases are counted from 0")
@@ -131,6 +139,9 @@ def plan_case(index: int, *, seed: int) -> dict[str, Any]:
         ]
         names.append(str(rng.choice(candidates)))
         strengths.append(float(rng.choice(STRENGTHS)))
+    in_fitted_noise = kind not in _NEVER_STRONG and bool(rng.random() < 0.5)
+    if in_fitted_noise:
+        strengths = [float(rng.choice(STRONG_IN_FITTED_NOISE)) for _ in names]
     channel = (CATALOGUE | OUT_OF_CATALOGUE)[names[0]].channel if names else None
     possible = [
         how for how in DEGRADATIONS if channel != "ramp" or how in ("withheld", "substituted")
@@ -141,6 +152,7 @@ def plan_case(index: int, *, seed: int) -> dict[str, Any]:
         "kind": kind,
         "names": names,
         "strengths": strengths,
+        "in_fitted_noise": in_fitted_noise,
         "rate": rate,
         "seconds": seconds,
         "gaps": float(rng.uniform(0.0, 0.4)) if rng.random() < 0.5 else 0.0,
@@ -168,7 +180,7 @@ def plan_counterparts(plans: Sequence[dict[str, Any]], every: int) -> list[dict[
     --------
     >>> plans = plan_cases(20, seed=3)
     >>> len(plan_counterparts(plans, 4)), len(plan_counterparts(plans, 0))
-    (4, 0)
+    (5, 0)
     """
     with_effects = [plan for plan in plans if plan["names"]]
     chosen = with_effects[::every] if every else []

@@ -69,9 +69,9 @@ _ONE_AXIS_EFFECTS = (
 )
 _THREE_AXIS_EFFECTS = (*_ONE_AXIS_EFFECTS, "shared_source", "earth_rate", "scale_factor")
 
-#: There are few injections: half of them have the strength from which most should be named. Fitted
-#: noise reduces that of slow means, which may need the largest.
-_STRENGTHS = (2.5, 5.0, 5.0, 8.0)
+#: In fitted noise. There are few injections: half of them have the strength from which most should
+#: be named.
+_STRENGTHS = (3.0, 5.0, 5.0, 8.0)
 
 
 def plan_injections(number: int, *, seed: int) -> list[dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.stats import gmean
 
 from gyrostab.blindtest.scoring.proportions import share_columns, wilson
 from gyrostab.blindtest.scoring.score import CATALOGUE_KINDS, catalogue_rows, drawn_rows, first_rows
@@ -19,6 +21,10 @@ Row = Mapping[str, Any]
 
 _CURVES = [f"{key}{end}" for key in ("detected", "named") for end in ("", "_low", "_high")]
 _RANKS = 10  # groups of the rank histogram
+#: Limits between ranges of strength in known noise, for all effects and for one, which has fewer
+#: cases; detection is not required below strength 1.5.
+_KNOWN_LIMITS = (0.75, 1.25, CLEAR_STRENGTH, 2.0, 3.0, 4.5, 7.0, 12.0)
+_EFFECT_LIMITS = (CLEAR_STRENGTH, 4.0, 12.0)
 #: Limits between ranges of strength in fitted noise.
 _FITTED_LIMITS = (0.5, 1.0, CLEAR_STRENGTH, 2.0, SURE_STRENGTH, 5.0)
 
@@ -26,24 +32,28 @@ _FITTED_LIMITS = (0.5, 1.0, CLEAR_STRENGTH, 2.0, SURE_STRENGTH, 5.0)
 def curves(rows: Sequence[Row]) -> pd.DataFrame:
     """Compute the shares detected and named against strength, by effect and for all effects.
 
-    For an effect out of catalogue, unidentified counts as named.
+    For an effect out of catalogue, unidentified counts as named. Similar strengths count together.
 
     Returns
     -------
     pandas.DataFrame
-        ``effect``, ``strength``, ``n``, ``detected``, ``detected_low``, ``detected_high``,
+        ``effect``, ``strength`` (the geometric mean), ``n``, ``detected``, ``detected_low``, ``detected_high``,
         ``named``, ``named_low``, ``named_high``.
     """
     groups = defaultdict(list)
     for row in rows:
         if row["kind"] in (*CATALOGUE_KINDS, "out_of_catalogue") and row["effect"]:
-            groups[row["effect"], row["strength"]].append(row)
+            groups[row["effect"], bisect(_EFFECT_LIMITS, row["strength"])].append(row)
             if row["kind"] != "out_of_catalogue":
-                groups["all", row["strength"]].append(row)
+                groups["all", bisect(_KNOWN_LIMITS, row["strength"])].append(row)
     return pd.DataFrame(
         [
-            {"effect": effect, "strength": strength, **_count_shares(groups[effect, strength])}
-            for effect, strength in sorted(groups, key=lambda key: (key[0] != "all", key))
+            {
+                "effect": key[0],
+                "strength": float(f"{gmean([row['strength'] for row in groups[key]]):.4g}"),
+                **_count_shares(groups[key]),
+            }
+            for key in sorted(groups, key=lambda key: (key[0] != "all", key))
         ]
     )
 

@@ -47,7 +47,7 @@ def prove(
         One in N cases with effects is diagnosed without its effects too (default: 4; 0 for none).
     real
         Folder of real recordings (default: $GYROSTAB_RECORDINGS); one injection is made for every
-        40 cases. Without the folder there are no injections.
+        20 cases. Without the folder there are no injections.
     resume
         Continue a run that was stopped or killed, or start one.
     """
