@@ -37,8 +37,8 @@ def curves(rows: Sequence[Row]) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        ``effect``, ``strength`` (the geometric mean), ``n``, ``detected``, ``detected_low``, ``detected_high``,
-        ``named``, ``named_low``, ``named_high``.
+        ``effect``, ``strength`` (the geometric mean), ``n``, ``detected``, ``detected_low``,
+        ``detected_high``, ``named``, ``named_low``, ``named_high``.
     """
     groups = defaultdict(list)
     for row in rows:
