@@ -15,8 +15,8 @@ from gyrostab.physics.phase import (
     TURN,
     fold,
     turn_means,
+    turn_means_of_windows,
     turns_of_samples,
-    turns_of_windows,
 )
 from gyrostab.units import INNER
 
@@ -117,18 +117,16 @@ class EarthRate(Effect):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         middle, inside, state = turns_of_samples(chunk.drivers["rotation_rate"], chunk.rate, state)
-        return self._average_rate(middle, inside, chunk.setup.axes), state
+        along, across, phase = self._rates_on(chunk.setup.axes)
+        means = turn_means(middle, inside, phase[:, None])
+        return np.asarray(along[:, None] + across[:, None] * means), state
 
-    def _average_rate(self, middle: Array, inside: Array, axes: tuple[str, ...]) -> Array:
-        """Average the rate on the axes over intervals."""
+    def _rates_on(self, axes: tuple[str, ...]) -> tuple[Array, Array, Array]:
+        """Return the constant rate of each axis, and amplitude and phase of the one that turns."""
         along, high, right = self.components()
         off, around = self.directions(axes)
         phase = math.radians(self.toolface) + around - math.atan2(right, high)
-        across = math.hypot(high, right) * np.sin(off)
-        return np.asarray(
-            along * np.cos(off)[:, None]
-            + across[:, None] * turn_means(middle, inside, phase[:, None])
-        )
+        return along * np.cos(off), math.hypot(high, right) * np.sin(off), phase
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """List initial toolfaces; a survey knows the other parameters."""
@@ -137,7 +135,9 @@ class EarthRate(Effect):
     def explain(self, windows: Windows) -> Prediction:
         """Predict window means, and the frequency of the line."""
         rotation = windows.drivers["rotation_rate"]
-        rates = self._average_rate(*turns_of_windows(windows, rotation), windows.axes)
+        constant, turning, phase = self._rates_on(windows.axes)
+        means = turn_means_of_windows(windows, rotation, phase)
+        rates = constant[:, None] + turning[:, None] * means
         off, around = self.directions(windows.axes)
         across = math.hypot(*self.components()[1:]) / self.rate if self.rate else 0.0
         pattern = np.zeros((len(windows.axes), 3), np.complex128)

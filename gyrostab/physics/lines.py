@@ -27,8 +27,8 @@ from gyrostab.physics.phase import (
     sine_means,
     steady_line,
     turn_means,
+    turn_means_of_windows,
     turns_of_samples,
-    turns_of_windows,
 )
 from gyrostab.units import INNER
 
@@ -174,18 +174,12 @@ class RotationLine(Effect):
         rotation = chunk.drivers["rotation_rate"]
         middle, inside, state = turns_of_samples(self.order * rotation, chunk.rate, state)
         amplitude = self.expand_to_axes("amplitude", chunk.setup.axes)
-        lines = self._sum_lines(middle, inside, chunk.setup.axes, amplitude)
+        phase = np.radians(self.expand_to_axes("phase", chunk.setup.axes))
+        lines = amplitude[:, None] * sum(
+            k**-self.rolloff * turn_means(k * middle, k * inside, k * phase[:, None])
+            for k in range(1, int(self.harmonics) + 1)
+        )
         return lines * (np.abs(rotation) >= _LEAST_TURNING_DEG_S), state
-
-    def _sum_lines(
-        self, middle: Array, inside: Array, axes: tuple[str, ...], amplitude: Array
-    ) -> Array:
-        """Sum the averaged lines of amplitude one."""
-        total = np.zeros((len(axes), middle.size))
-        phase = np.radians(self.expand_to_axes("phase", axes))[:, None]
-        for k in range(1, int(self.harmonics) + 1):
-            total += k**-self.rolloff * turn_means(k * middle, k * inside, k * phase)
-        return amplitude[:, None] * total
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """List phases over half a turn (the amplitude is signed), and lines per turn."""
@@ -193,12 +187,15 @@ class RotationLine(Effect):
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict window means at slow rotation, the comb, and the frequencies of the lines."""
-        rotation = self.order * windows.drivers["rotation_rate"]
-        middle, inside = turns_of_windows(windows, rotation)
-        turning = np.abs(windows.drivers["rotation_rate"]) >= _LEAST_TURNING_DEG_S
-        mean = self._sum_lines(middle, inside, windows.axes, np.ones(len(windows.axes))) * turning
+        rotation = windows.drivers["rotation_rate"]
+        phase = np.radians(self.expand_to_axes("phase", windows.axes))
+        mean = sum(
+            k**-self.rolloff
+            * turn_means_of_windows(windows, rotation, k * phase, order=k * self.order)
+            for k in range(1, int(self.harmonics) + 1)
+        ) * (np.abs(rotation) >= _LEAST_TURNING_DEG_S)
         k = np.arange(1.0, int(self.harmonics) + 1)[:, None]
-        cycles = k * np.abs(rotation) / TURN
+        cycles = k * self.order * np.abs(rotation) / TURN
         place = fold(cycles, windows.rate)
         power = 0.5 * (k**-self.rolloff * np.sinc(cycles / windows.rate)) ** 2
         comb = comb_density(windows, place, power)

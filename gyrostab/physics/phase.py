@@ -68,6 +68,33 @@ def turns_of_windows(windows: Windows, rotation: Array) -> tuple[Array, Array]:
     )
 
 
+def turn_means_of_windows(
+    windows: Windows, rotation: Array, phase: Array, *, order: float = 1.0
+) -> Array:
+    """Average ``cos(2 pi order turns + phase)`` over windows, as measured where that is known.
+
+    Otherwise the rotation is taken as even within a window, which it is not in stick-slip.
+
+    Parameters
+    ----------
+    rotation : ndarray, shape (window,)
+        Mean rotation rate [degree s-1].
+    phase : ndarray, shape (axis,)
+        Phase on each axis of the windows [radian].
+
+    Returns
+    -------
+    ndarray, shape (axis, window)
+    """
+    middle, inside = turns_of_windows(windows, order * rotation)
+    means = turn_means(middle, inside, phase[:, None])
+    for row, axis in enumerate(windows.axes):
+        known = windows.turn_means.get(axis, np.empty((0, 0)))
+        if order in range(1, known.shape[1] + 1):
+            means[row] = (known[:, int(order) - 1] * np.exp(1j * phase[row])).real
+    return means
+
+
 def line_density(windows: Windows, frequency: Array | float, power: Array | float) -> Array:
     """Compute the two-sided density [unit of `power` Hz-1] that a line adds to its band.
 

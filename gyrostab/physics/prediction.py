@@ -37,6 +37,9 @@ class Windows:
     #: (window,): turns of the ramp per second, negative where it falls [Hz]; empty where no ramp
     #: was recorded.
     turns: Array = field(default_factory=lambda: np.empty(0))
+    #: (window, harmonic): mean of exp(2 pi i h n) after n turns of the channel rotation_rate since
+    #: the start, over the samples of every axis, for the harmonics 1, 2, ...; empty where unknown.
+    turn_means: Mapping[str, NDArray[np.complex128]] = field(default_factory=dict)
     #: Edges [Hz] of the band of which a channel is the rms, if the log states them.
     bands: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -177,3 +179,27 @@ def test_chunks_never_matter(seed, which):
     same_whatever_the_cuts(
         make_effect(table), random_cuts(seed, 700), size=700, drivers=drivers, seed=seed
     )
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        {"name": "earth_rate", "latitude": 60.0, "inclination": 30.0, "azimuth": 60.0},
+        {"name": "rotation_line", "amplitude": 2.0, "phase": 40.0, "order": 1.0, "harmonics": 3},
+    ],
+)
+def test_means_in_stick_slip_follow_the_measured_means_of_the_turns(table):
+    time = np.arange(20_000) / 50.0
+    rotation = 90.0 + 80.0 * np.sin(1.4 * np.pi * time)  # uneven within each window of 8 s
+    effect = make_effect(table)
+    rates = run(effect, size=time.size, rate=50.0, drivers={"rotation_rate": rotation})
+    windows, means = windows_of(rates, 50.0, 400, {"rotation_rate": rotation})
+    inside = rotation / (360.0 * 50.0)
+    turns = np.cumsum(inside) - inside / 2.0
+    harmonics = np.exp(2j * np.pi * turns[:, None] * [1, 2, 3]).reshape(-1, 400, 3).mean(axis=1)
+    known = replace(windows, turn_means=dict.fromkeys(windows.axes, harmonics))
+    (size,) = effect.size_parameters
+    scale = np.atleast_1d(getattr(effect, size))[0]
+    np.testing.assert_allclose(scale * effect.explain(known).mean[size], means, atol=5e-3)
+    uneven = scale * effect.explain(windows).mean[size] - means
+    assert np.abs(uneven).max() > 0.1

@@ -80,6 +80,9 @@ def make_windows(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
         if "profile" in blocks
         else np.empty(0),
         turns=blocks["ramp_turns"].values if "ramp_turns" in blocks else np.empty(0),
+        turn_means=dict(zip(axes, blocks["turn_mean"].values, strict=True))
+        if "turn_mean" in blocks and drivers.get("rotation_rate") == "rotation_rate"
+        else {},
         bands={
             inner: band
             for inner, name in drivers.items()
@@ -334,6 +337,7 @@ def make_surrogates(
             windows,
             drivers={inner: fill_linearly(rotate(values)) for inner, values in channels.items()},
             fine={inner: rotate(values) for inner, values in windows.fine.items()},
+            turn_means={axis: rotate(values) for axis, values in windows.turn_means.items()},
         )
         if not effects()[candidate.effect].follows_axes:
             return shifted

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ from gyrostab.diagnose.reduce.outliers import (
     simultaneous_samples,
     simultaneous_zeros,
 )
-from gyrostab.diagnose.reduce.rotation_orders import make_rotation_orders
+from gyrostab.diagnose.reduce.rotation_orders import HARMONICS, make_rotation_orders
 from gyrostab.diagnose.reduce.steady_sines import SineSearch
 from gyrostab.kernels.spectra import periodogram as kernel
 from gyrostab.kernels.spectra.outliers import HISTOGRAM
@@ -86,6 +87,8 @@ class Accumulator:
         self.gaps: list[tuple[int, int]] = []
         self.gap_begin: int | None = None
         self.rotation = make_rotation_orders(log, length, rate)
+        self.turn_line_sum = np.zeros((len(HARMONICS), kernel.ordinates(length)))
+        self.turn_line_expected = np.zeros(kernel.ordinates(length))
         self.ramp = self.channels.index("ramp") + self.axes if "ramp" in self.channels else None
         self.ramp_range = finite_range(log["ramp"].data) if self.ramp is not None else (0.0, 0.0)
         if self.ramp_range[0] >= self.ramp_range[1]:
@@ -145,8 +148,12 @@ class Accumulator:
             if number % every == 0
         ]
         if self.rotation is not None:
+            turns, inside = self.rotation.read_turns(block_range)
             by_name |= self.rotation.measure(
-                block_range, centred[:axes], counts[:axes, :, 0], self.min_samples
+                turns, inside, centred[:axes], counts[:axes, :, 0], self.min_samples
+            )
+            by_name["turn_power"] = self._measure_turn_spectra(
+                turns, np.logical_or.reduce(present[:axes])
             )
         if self.ramp is not None:
             profile = np.zeros((2, axes, count, RAMP_PHASE_BINS))
@@ -230,6 +237,30 @@ class Accumulator:
             "cross_neighbours": cross_neighbours,
             "cross_samples": cross_samples,
         }
+
+    def _measure_turn_spectra(self, turns: Array, present: NDArray[np.bool_]) -> Array:
+        """Return band powers of waves at the harmonics of the rotation, and add line spectra.
+
+        The waves have an amplitude of 1 and any phase, and are sampled where an axis is: an uneven
+        rotation or gaps spread them over many bands.
+
+        Returns
+        -------
+        ndarray, shape (harmonic, block, band)
+        """
+        used = np.count_nonzero(present, axis=-1) >= self.min_samples
+        place, table, _, _ = self._read_gaps(present, used)
+        power = np.zeros((len(HARMONICS), used.size, self.edges.size - 1))
+        for number, harmonic in enumerate(HARMONICS):
+            for wave in (np.cos, np.sin):
+                values = wave(2.0 * math.pi * harmonic * turns)
+                spectrum = self._transform_axes(_subtract_mean(values, present))
+                power[number] += self.band_powers(spectrum, spectrum, table, place).real / 2.0
+                square = spectrum[used].real ** 2 + spectrum[used].imag ** 2
+                self.turn_line_sum[number] += square.sum(axis=0) / 2.0
+        self.turn_line_expected += table[place[used]].sum(axis=0)
+        power[:, ~used] = 0.0
+        return power
 
     def _transform_axes(self, centred: Array) -> NDArray[np.complex128]:
         """Return the tapered spectra (..., line) of blocks (..., sample)."""

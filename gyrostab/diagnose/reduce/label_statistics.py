@@ -103,6 +103,9 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         "zone_width_stderr": zones[:, 1],
     }
     arrays |= work.sines.strongest(_line_frequencies(work)) | _sub_block_means(by_name)
+    if work.rotation is not None:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            arrays["turn_line_power"] = work.turn_line_sum / (work.turn_line_expected * work.rate)
     arrays |= _phase_locked_statistics(by_name) | _gap_table(work, log, restart)
     variables = (
         label_variables(arrays)
@@ -197,9 +200,8 @@ def _cross_spectra(
 
 def _phase_locked_statistics(by_name: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     """Return what is locked to the tool rotation and to the ramp phase."""
-    arrays: dict[str, Any] = {
-        name: by_name[name] for name in ("order", "order_level") if name in by_name
-    }
+    names = ("order", "order_level", "turn_mean", "turn_power")
+    arrays: dict[str, Any] = {name: by_name[name] for name in names if name in by_name}
     if "profile_sum" in by_name:
         samples = by_name["profile_samples"]
         with np.errstate(invalid="ignore", divide="ignore"):

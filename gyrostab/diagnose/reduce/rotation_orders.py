@@ -39,20 +39,37 @@ class RotationOrders:
         self.carry: float | None = None
         self.turns = 0.0
 
-    def measure(
-        self, block_range: slice, centred: Array, counts: NDArray[np.int64], min_samples: float
-    ) -> dict[str, NDArray[Any]]:
-        """Demodulate blocks of the axes (axis, block, sample), zero where samples are missing."""
+    def read_turns(self, block_range: slice) -> tuple[Array, Array]:
+        """Return the turns up to the middle of each sample, and within it, (block, sample) each.
+
+        The turns are counted from the start, less a number of whole turns.
+        """
         index = np.arange(block_range.start * self.length, block_range.stop * self.length)
         instants = grid_times(self.start, self.rate, index)
         rotation, self.carry = self.source.at(instants, self.carry)
         inside = rotation * self.factor / (360.0 * self.rate)
         edges = np.cumsum(np.concatenate([[self.turns], inside]))
         self.turns = math.fmod(float(edges[-1]), 1.0)
-        turns = (edges[:-1] + inside / 2.0).reshape(centred.shape[1:])
-        often = np.diff(edges).reshape(turns.shape).sum(axis=-1)
+        shape = (-1, self.length)
+        return (edges[:-1] + inside / 2.0).reshape(shape), inside.reshape(shape)
+
+    def measure(
+        self,
+        turns: Array,
+        inside: Array,
+        centred: Array,
+        counts: NDArray[np.int64],
+        min_samples: float,
+    ) -> dict[str, NDArray[Any]]:
+        """Demodulate blocks of the axes (axis, block, sample), zero where samples are missing."""
+        often = inside.sum(axis=-1)
         enough = (np.abs(often) >= 1.0) & (counts >= min_samples)
         wheels = [np.exp(-2j * math.pi * harmonic * turns) for harmonic in HARMONICS]
+        present = centred != 0.0
+        turn_mean = [
+            _mean_of_present(np.conj(wheel) * np.sinc(harmonic * inside), present)
+            for harmonic, wheel in zip(HARMONICS, wheels, strict=True)
+        ]
         # a harmonic above half of the sampling rate has the samples of one below
         is_sampled = np.abs(often)[:, None] * HARMONICS < self.length / 2.0
         order, residual = _fit_harmonics(centred, wheels, enough, is_sampled)
@@ -61,7 +78,19 @@ class RotationOrders:
             for harmonic, wheel in zip(HARMONICS, wheels, strict=True):
                 level = _power_near_order(residual * wheel, often, harmonic)
                 order_level.append(np.where(enough, level / (counts * self.rate), np.nan))
-        return {"order": order, "order_level": np.stack(order_level, -1)}
+        return {
+            "order": order,
+            "order_level": np.stack(order_level, -1),
+            "turn_mean": np.stack(turn_mean, -1),
+        }
+
+
+def _mean_of_present(
+    values: NDArray[np.complex128], present: NDArray[np.bool_]
+) -> NDArray[np.complex128]:
+    """Average values (block, sample) over the samples present (axis, block, sample), else all."""
+    used = present | ~present.any(axis=-1, keepdims=True)
+    return np.asarray(np.einsum("bs,abs->ab", values, used) / used.sum(axis=-1))
 
 
 def _fit_harmonics(

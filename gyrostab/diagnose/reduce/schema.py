@@ -130,6 +130,19 @@ BLOCK_STATISTICS: dict[str, Variable] = {
         _POWER,
         "density of what turns 1 to 4 times in the block more or less than that, two-sided",
     ),
+    "turn_mean": Variable(
+        _HARMONIC,
+        "1",
+        "mean of exp(2 pi i h n) over the samples of the axis, after n turns since the start",
+    ),
+    "turn_power": Variable(
+        ("harmonic", "block", "band"),
+        "Hz-1",
+        "mean periodogram of a wave of amplitude 1 at that multiple, two-sided density",
+    ),
+    "turn_line_power": Variable(
+        ("harmonic", "line"), "Hz-1", "that of the record at full resolution"
+    ),
     "profile": Variable(_PHASE, _RATE, "mean rate less the block's mean, by phase of the ramp"),
     "profile_samples": Variable(_PHASE, "1", "samples of each mean"),
     "ramp_turns": Variable(

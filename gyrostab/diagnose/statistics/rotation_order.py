@@ -12,8 +12,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.held_out import LinearModel
+from gyrostab.diagnose.evidence.spectral_lines import interpolate_bands
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
-from gyrostab.diagnose.predict.condition import bands_at, free_covariance
+from gyrostab.diagnose.predict.condition import free_covariance
 from gyrostab.diagnose.predict.linear_model import (
     State,
     real_and_imaginary,
@@ -138,9 +139,12 @@ class RotationOrder(Statistic):
         return LinearModel(values, cell_weight, designs, columns, -np.eye(len(given)))
 
     def condition(self, state: State, component: Component) -> State:
-        """Condition on a component in the rotation orders."""
+        """Condition on a component in the rotation orders, and where it shows in the spectrum.
+
+        An uneven rotation or gaps spread a harmonic over many bands and lines.
+        """
         count = state.blocks.sizes["harmonic"]
-        turn = np.abs(state.blocks["channel_rotation_rate"].values) / 360.0
+        sizes = _fit_sizes_of(component, state)
         if component.candidate.is_per_axis:
             chosen = harmonic_sets(count)[component.place]
             patterns = [(axis, np.ones(count, np.complex128)) for axis in component.row]
@@ -149,18 +153,20 @@ class RotationOrder(Statistic):
             if is_reversed(component):
                 pattern = np.conj(pattern)
             patterns = [(axis, pattern[state.axes.index(axis)]) for axis in component.row]
+        masked = np.zeros(state.blocks.sizes["line"], np.bool_)
         for axis, pattern in patterns:
             state = state.with_columns("order", axis, order_columns(pattern, chosen))
-            for k in chosen:
-                density = bands_at(state, turn * (k + 1)).astype(float)
-                for band in np.flatnonzero(density.any(axis=0)):
+            for k, size in zip(chosen, sizes, strict=True):
+                square = (size * abs(pattern[k])) ** 2
+                density = square * state.blocks["turn_power"].values[k]
+                for band in np.flatnonzero(_visible_bands(density, axis, state)):
                     column = np.zeros_like(density)
-                    column[:, band] = density[:, band]
+                    column[:, band] = density[:, band] / density[:, band].max()
                     state = state.with_columns("power", axis, [column])
                     state = free_covariance(state, (axis,), column)
-        lines = state.blocks["line_frequency"].values
-        near_order = np.logical_or.reduce([_lines_near(lines, turn * (k + 1)) for k in chosen])
-        return state.with_columns("line", "all", [near_order])
+                line_power = square * state.blocks["turn_line_power"].values[k]
+                masked |= _visible_lines(line_power, axis, state)
+        return state.with_columns("line", "all", [masked])
 
     def estimate(self, fit: SizeFit) -> Sizes:
         """Return amplitude and phase of components locked to the rotation.
@@ -252,14 +258,32 @@ def fit_amplitude(component: Component, state: State) -> tuple[float, float, flo
     return float(math.hypot(mean[0], mean[1])), sd, math.degrees(math.atan2(mean[1], mean[0]))
 
 
-def _lines_near(lines: Array, turning: Array) -> NDArray[np.bool_]:
-    """Find the lines within two lines of the rates of blocks that turn, and between neighbours."""
-    pairs = np.stack([np.append(turning, turning[:-1]), np.append(turning, turning[1:])])
-    low, high = np.sort(pairs[:, (pairs > 0.0).all(axis=0)], axis=0)
-    ends = np.zeros(lines.size + 1)
-    np.add.at(ends, np.searchsorted(lines, low - 2.0 * lines[0]), 1.0)
-    np.add.at(ends, np.searchsorted(lines, high + 2.0 * lines[0], side="right"), -1.0)
-    return np.asarray(np.cumsum(ends[:-1]) > 0.0)
+def _fit_sizes_of(component: Component, state: State) -> list[float]:
+    """Return the amplitudes of the harmonics of a component, of a pattern of 1."""
+    mean, _ = component_mixture(component, state).moments()
+    count = 2 * len(
+        harmonic_sets(state.blocks.sizes["harmonic"])[component.place]
+        if component.candidate.is_per_axis
+        else (0,)
+    )
+    return [float(math.hypot(*mean[place : place + 2])) for place in range(0, count, 2)]
+
+
+def _visible_bands(density: Array, axis: str, state: State) -> NDArray[np.bool_]:
+    """Find the bands in which an added density (block, band) is visible in the record."""
+    row = state.axes.index(axis)
+    shape = np.nan_to_num(state.blocks["shape"].values[row])
+    ratio = density / state.weight[row]
+    return np.asarray((shape * ratio**2).sum(axis=0) >= state.settings.visible_sigma**2)
+
+
+def _visible_lines(line_power: Array, axis: str, state: State) -> NDArray[np.bool_]:
+    """Find the lines at which an added density (line,) is visible in the record."""
+    row, blocks = state.axes.index(axis), state.blocks
+    bands, lines = blocks["frequency"].values, blocks["line_frequency"].values
+    noise = interpolate_bands(state.weight[row].mean(axis=0)[None], lines, bands)[0]
+    count = blocks["line_weight"].values[row].sum()
+    return np.asarray(line_power / noise * math.sqrt(count) >= state.settings.visible_sigma)
 
 
 def turns_per_second(blocks: xr.Dataset) -> Array:

@@ -258,11 +258,25 @@ def test_orders_of_an_uneven_rotation_with_losses_show_one_harmonic_only():
     rate[np.random.default_rng(1).random(rate.size) < 0.1] = np.nan
     channels = {"rotation_rate": (3600.0 * inside, "deg/s")}
     log = make_log(rate[None], rate=10.0, unit="deg/h", channels=channels)
-    order = reduce_log(log, block="20s")["order"].values[0]
+    blocks = reduce_log(log, block="20s")
+    order = blocks["order"].values[0]
     fitted = np.isfinite(order).all(axis=1)
     assert fitted.mean() > 0.9
     np.testing.assert_allclose(np.abs(order[fitted, 0]), 5.0, rtol=1e-6)
     assert np.abs(order[fitted, 1:]).max() < 1e-6
+    # the mean of the samples that are present, which an even rotation would not have
+    first = blocks["turn_mean"].values[0, :, 0]
+    expected = (5.0 * first * np.exp(0.7j)).real
+    np.testing.assert_allclose(blocks["mean"].values[0], expected, atol=0.03)
+    assert np.abs(expected).max() > 0.5
+    # and the side bands, with what the losses leave in all other bands
+    power, wave = blocks["power"].values[0], blocks["turn_power"].values[0]
+    np.testing.assert_allclose(25.0 * wave.sum(axis=0), power.sum(axis=0), rtol=0.2)
+    line_power = blocks["line_power"].values[0].mean(axis=0)
+    line_wave = blocks["turn_line_power"].values[0]
+    strong = line_power > 1e-3 * line_power.max()
+    assert strong.sum() > 20
+    np.testing.assert_allclose(25.0 * line_wave[strong], line_power[strong], rtol=0.3)
 
 
 def test_orders_use_a_slower_rotation_sensor_and_are_missing_at_rest():

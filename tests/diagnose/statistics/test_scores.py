@@ -16,7 +16,6 @@ from gyrostab.diagnose.statistics import cross_spectrum as cross_axis
 from gyrostab.diagnose.statistics import find_statistic, mean
 from gyrostab.diagnose.statistics import power as davar
 from gyrostab.diagnose.statistics.restart import _restart_blocks
-from gyrostab.diagnose.statistics.rotation_order import _lines_near
 from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     exponential_score,
@@ -372,12 +371,3 @@ def test_the_first_block_after_a_restart_is_that_with_most_samples_after_it():
     for lost, back, first in ((25.0, 42.0, 2), (25.0, 58.0, 2), (43.0, 59.0, 3), (44.0, 46.0, 2)):
         restart = {"restart_begin": ("restart", [lost]), "restart_end": ("restart", [back])}
         assert _restart_blocks(xr.Dataset({**times, **restart})).tolist() == [first]
-
-
-def test_lines_near_an_order_are_those_of_blocks_that_turn():
-    lines = np.arange(1, 101) * 0.05
-    turning = np.array([0.0, 0.0, 2.0, 2.1, np.nan, 2.0, 0.0])
-    near = lines[_lines_near(lines, turning)]
-    assert near.min() == pytest.approx(1.9)
-    assert near.max() == pytest.approx(2.2)
-    assert not _lines_near(lines, np.zeros(4)).any()
