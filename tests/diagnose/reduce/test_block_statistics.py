@@ -274,8 +274,8 @@ def test_orders_of_an_uneven_rotation_with_losses_show_one_harmonic_only():
     np.testing.assert_allclose(25.0 * wave.sum(axis=0), power.sum(axis=0), rtol=0.2)
     line_power = blocks["line_power"].values[0].mean(axis=0)
     line_wave = blocks["turn_line_power"].values[0]
-    strong = line_power > 1e-3 * line_power.max()
-    assert strong.sum() > 20
+    strong = line_power > 0.01 * line_power.max()
+    assert strong.sum() >= 5
     np.testing.assert_allclose(25.0 * line_wave[strong], line_power[strong], rtol=0.3)
 
 
