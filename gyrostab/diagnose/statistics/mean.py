@@ -283,8 +283,7 @@ def _matched_filter(residual: Array, noise: MeanNoise, windows: Windows) -> tupl
     weighted_ones = apply_precision(np.ones(residual.shape[-1]), noise)
     total = weighted_ones.sum()
     weighted = weighted - weighted_ones * (weighted.sum(axis=-1, keepdims=True) / total)
-    boxcar = np.empty(windows.first.size)
-    boxcar_information(windows.first, windows.stop, *noise[1:], boxcar)
+    boxcar = boxcar_information(windows.first, windows.stop, *noise[1:])
     across = sum_over_windows(weighted_ones, windows, axis=-1)
     count = sum_over_windows(noise.present, windows, axis=-1)
     information = boxcar - across**2 / total
@@ -310,26 +309,22 @@ def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, series: Arra
     processes = expected_processes(baseline, axis)
     slow = np.append(b**2 * share, processes.square * block_mean_variance(block, processes.time))
     times = np.append(times, processes.time)
-    decay = np.exp(-step[:, None] / times)
+    decay = np.exp(-step[:, None] / np.append(np.inf, times))  # the random walk does not relax
     variance = baseline["mean_variance"].values[axis] + b**2 * white
     n = variance.size
     present = np.isfinite(series).reshape(-1, n).any(axis=0)
     present = present & np.isfinite(variance) & (variance > 0)
-    innovation, gain = np.empty(n), np.empty((n, times.size + 1))
-    remaining = np.empty((n + 1, times.size + 1, times.size + 1))
-    filter_gains(
-        variance, present, (k**2 / HOUR + processes.walk) * step, slow, decay, innovation, gain
-    )
-    remaining_information(innovation, gain, decay, remaining)
+    walk = (k**2 / HOUR + processes.walk) * step
+    innovation, gain = filter_gains(variance, present, walk, slow, decay)
+    remaining = remaining_information(innovation, gain, decay)
     return MeanNoise(present.astype(float), innovation, gain, decay, remaining)
 
 
 def apply_precision(series: Array, noise: MeanNoise) -> Array:
     """Multiply each series (..., block) by the inverse covariance; zero at missing blocks."""
     rows = np.ascontiguousarray(series.reshape(-1, series.shape[-1]), dtype=np.float64)
-    out = np.empty_like(rows)
-    precision_times(rows, noise.innovation, noise.gain, noise.decay, out)
-    return out.reshape(series.shape)
+    out = precision_times(rows, noise.innovation, noise.gain, noise.decay)
+    return np.asarray(out.reshape(series.shape))
 
 
 def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Array) -> float:

@@ -4,6 +4,11 @@ For the covariance C of the series these kernels compute ``C^-1 y`` (the disturb
 Jong) and ``x' C^-1 x`` for every boxcar x, so that the matched filter of a boxcar is a sum of
 ``C^-1 y`` over it. No array of the size of C is made.
 
+A series of n observations is the sum of q states: a random walk that begins at zero, and q - 1
+relaxing processes. ``decay`` (n, q) is the decay of each state until the next observation, 1 for
+the random walk. ``innovation`` (n,) and ``gain`` (n, q) are results of `filter_gains`, infinite and
+zero where there is no observation.
+
 References
 ----------
 Durbin and Koopman, Time Series Analysis by State Space Methods, 2nd ed. (2012), sections 4.5 and
@@ -19,33 +24,20 @@ from gyrostab.kernels.compiled import KERNEL
 
 
 @njit(**KERNEL)
-def filter_gains(variance, present, walk, ou_variance, decay, innovation, gain):  # type: ignore[no-untyped-def]
+def filter_gains(variance, present, walk, ou_variance, decay):  # type: ignore[no-untyped-def]
     """Run a Kalman filter that observes the sum of its states: innovation variances and gains.
 
-    Parameters
-    ----------
-    variance : float64 (n,)
-        White variance of each observation.
-    present : bool (n,)
-        False where there is no observation.
-    walk : float64 (n,)
-        Increase of the variance of the random walk until the next observation.
-    ou_variance : float64 (p,)
-        Variances of the relaxing processes.
-    decay : float64 (n, p)
-        Decay of each process until the next observation.
-    innovation, gain : float64 (n,), (n, p + 1)
-        Results; the random walk is the first state, and begins at zero.
+    `variance` (n,) is the white variance of each observation, ``present`` (n,) is False where there
+    is none, `walk` (n,) is the increase of the variance of the random walk until the next
+    observation, and `ou_variance` (q - 1,) are the variances of the relaxing processes.
     """
-    n, p = decay.shape
-    q = p + 1
+    n, q = decay.shape
+    innovation, gain = np.full(n, np.inf), np.zeros((n, q))
     state = np.zeros((q, q))
-    for i in range(p):
-        state[i + 1, i + 1] = ou_variance[i]
+    for i in range(1, q):
+        state[i, i] = ou_variance[i - 1]
     along = np.empty(q)
     for t in range(n):
-        gain[t] = 0.0
-        innovation[t] = np.inf
         if present[t]:
             total = variance[t]
             for i in range(q):
@@ -59,30 +51,22 @@ def filter_gains(variance, present, walk, ou_variance, decay, innovation, gain):
                     state[i, j] -= gain[t, i] * along[j]
         for i in range(q):
             for j in range(q):
-                left = 1.0 if i == 0 else decay[t, i - 1]
-                right = 1.0 if j == 0 else decay[t, j - 1]
-                state[i, j] *= left * right
+                state[i, j] *= decay[t, i] * decay[t, j]
         state[0, 0] += walk[t]
-        for i in range(p):
-            state[i + 1, i + 1] += ou_variance[i] * (1.0 - decay[t, i] ** 2)
+        for i in range(1, q):
+            state[i, i] += ou_variance[i - 1] * (1.0 - decay[t, i] ** 2)
+    return innovation, gain
 
 
 @njit(**KERNEL)
-def precision_times(columns, innovation, gain, decay, out):  # type: ignore[no-untyped-def]
-    """Multiply each column by the inverse covariance, ``C^-1 y``; zero without an observation.
+def precision_times(columns, innovation, gain, decay):  # type: ignore[no-untyped-def]
+    """Multiply each row of `columns` (m, n) by the inverse covariance, ``C^-1 y``.
 
-    Parameters
-    ----------
-    columns : float64 (m, n)
-        The series, one per row; values at missing observations are not used.
-    innovation, gain, decay : float64 (n,), (n, p + 1), (n, p)
-        As in `filter_gains`.
-    out : float64 (m, n)
-        Result.
+    Zero without an observation, whatever the value there.
     """
     m, n = columns.shape
     q = gain.shape[1]
-    state = np.empty(q)
+    out, state = np.zeros((m, n)), np.empty(q)
     for row in range(m):
         state[:] = 0.0
         for t in range(n):
@@ -91,13 +75,12 @@ def precision_times(columns, innovation, gain, decay, out):  # type: ignore[no-u
                 out[row, t] = error / innovation[t]
                 for i in range(q):
                     state[i] += gain[t, i] * error
-            for i in range(1, q):
-                state[i] *= decay[t, i - 1]
+            for i in range(q):
+                state[i] *= decay[t, i]
         state[:] = 0.0
-        for back in range(n):
-            t = n - 1 - back
-            for i in range(1, q):
-                state[i] *= decay[t, i - 1]
+        for t in range(n - 1, -1, -1):
+            for i in range(q):
+                state[i] *= decay[t, i]
             if np.isfinite(innovation[t]):
                 value = out[row, t]
                 for i in range(q):
@@ -105,31 +88,22 @@ def precision_times(columns, innovation, gain, decay, out):  # type: ignore[no-u
                 out[row, t] = value
                 for i in range(q):
                     state[i] += value
-            else:
-                out[row, t] = 0.0
+    return out
 
 
 @njit(**KERNEL)
-def remaining_information(innovation, gain, decay, out):  # type: ignore[no-untyped-def]
+def remaining_information(innovation, gain, decay):  # type: ignore[no-untyped-def]
     """Compute the information of all later observations about the states predicted at each.
 
-    Parameters
-    ----------
-    innovation, gain, decay : float64 (n,), (n, p + 1), (n, p)
-        As in `filter_gains`.
-    out : float64 (n + 1, p + 1, p + 1)
-        Result; the last is zero.
+    The result is (n + 1, q, q); the last is zero.
     """
     n, q = gain.shape
-    out[n] = 0.0
+    out = np.zeros((n + 1, q, q))
     later = np.empty((q, q))
-    for back in range(n):
-        t = n - 1 - back
+    for t in range(n - 1, -1, -1):
         for i in range(q):
             for j in range(q):
-                left = 1.0 if i == 0 else decay[t, i - 1]
-                right = 1.0 if j == 0 else decay[t, j - 1]
-                later[i, j] = out[t + 1, i, j] * left * right
+                later[i, j] = out[t + 1, i, j] * decay[t, i] * decay[t, j]
         if not np.isfinite(innovation[t]):
             out[t] = later
             continue
@@ -142,25 +116,17 @@ def remaining_information(innovation, gain, decay, out):  # type: ignore[no-unty
         for i in range(q):
             for j in range(q):
                 out[t, i, j] = later[i, j] - along[i] - along[j] + information
+    return out
 
 
 @njit(**KERNEL)
-def boxcar_information(first, stop, innovation, gain, decay, remaining, out):  # type: ignore[no-untyped-def]
-    """Compute ``x' C^-1 x`` of the boxcars x that are 1 from `first` up to `stop`.
+def boxcar_information(first, stop, innovation, gain, decay, remaining):  # type: ignore[no-untyped-def]
+    """Compute ``x' C^-1 x`` of the boxcars x that are 1 from `first` (k,) up to `stop` (k,).
 
-    Parameters
-    ----------
-    first, stop : int64 (k,)
-        Edges of the boxcars.
-    innovation, gain, decay : float64 (n,), (n, p + 1), (n, p)
-        As in `filter_gains`.
-    remaining : float64 (n + 1, p + 1, p + 1)
-        Result of `remaining_information`.
-    out : float64 (k,)
-        Result.
+    `remaining` is the result of `remaining_information`.
     """
     q = gain.shape[1]
-    state = np.empty(q)
+    out, state = np.empty(first.size), np.empty(q)
     for box in range(first.size):
         state[:] = 0.0
         total = 0.0
@@ -170,9 +136,10 @@ def boxcar_information(first, stop, innovation, gain, decay, remaining, out):  #
                 total += error * error / innovation[t]
                 for i in range(q):
                     state[i] += gain[t, i] * error
-            for i in range(1, q):
-                state[i] *= decay[t, i - 1]
+            for i in range(q):
+                state[i] *= decay[t, i]
         for i in range(q):
             for j in range(q):
                 total += state[i] * remaining[stop[box], i, j] * state[j]
         out[box] = total
+    return out

@@ -67,22 +67,16 @@ def test_boxcar_kernels_match_dense_algebra():
     )
     decay = np.exp(-rng.uniform(0.5, 1.5, (n, 1)) / np.array([1.0, 5.0, 30.0]))
     present = rng.random(n) > 0.3
-    innovation, gain, remaining = (
-        np.empty(n),
-        np.empty((n, p + 1)),
-        np.empty((n + 1, p + 1, p + 1)),
-    )
-    filter_gains(variance, present, walk, ou, decay, innovation, gain)
-    remaining_information(innovation, gain, decay, remaining)
+    of_states = np.column_stack([np.ones(n), decay])
+    innovation, gain = filter_gains(variance, present, walk, ou, of_states)
+    noise = innovation, gain, of_states
     inverse = np.linalg.inv(_dense_covariance(variance, present, walk, ou, decay))
     series = rng.normal(size=(2, n))
-    out = np.empty_like(series)
-    precision_times(series, innovation, gain, decay, out)
+    out = precision_times(series, *noise)
     np.testing.assert_allclose(out[:, present], series[:, present] @ inverse, rtol=1e-9)
     assert not out[:, ~present].any()
     first, stop = np.array([0, 7, 30, 59]), np.array([60, 20, 31, 60])
-    information = np.empty(4)
-    boxcar_information(first, stop, innovation, gain, decay, remaining, information)
+    information = boxcar_information(first, stop, *noise, remaining_information(*noise))
     for region in range(4):
         x = ((np.arange(n) >= first[region]) & (np.arange(n) < stop[region]))[present].astype(float)
         assert information[region] == pytest.approx(x @ inverse @ x, rel=1e-9)
