@@ -132,14 +132,12 @@ def mean_changes(value_times: Array, values: Array, begin: Array, end: Array, ti
 
     Parameters
     ----------
-    value_times : ndarray, shape (n,)
-        Times of the values, rising [s].
-    values : ndarray, shape (n,)
-        T; extrapolated linearly beyond the ends.
+    value_times, values : ndarray, shape (n,)
+        Times, rising [s], and T; extrapolated linearly beyond the ends.
     begin, end : ndarray, shape (w,)
         Edges of the intervals [s]; T is constant before the first of them.
     time : float
-        Relaxation time [s].
+        Relaxation time [s]; 0 for T' itself.
 
     Returns
     -------
@@ -149,28 +147,18 @@ def mean_changes(value_times: Array, values: Array, begin: Array, end: Array, ti
     Examples
     --------
     >>> t, T = np.array([5.0, 15.0]), np.array([1.0, 3.0])
-    >>> mean_changes(t, T, np.array([0.0, 10.0]), np.array([10.0, 20.0]), 0.01)
-    array([0.1998, 0.2   ])
+    >>> begin, end = np.array([0.0, 10.0]), np.array([10.0, 20.0])
+    >>> mean_changes(t, T, begin, end, 0.01), mean_changes(t, T, begin, end, 0.0)
+    (array([0.1998, 0.2   ]), array([0.2, 0.2]))
     """
     at, line = _polygon_corners(value_times, values, begin, end)
-    followed = _follow_values(at, line, time)
-    return _average_growth(at, followed, begin, end)
+    return _average_growth(at, _follow_values(at, line, time) if time else line, begin, end)
 
 
 def mean_followed(
     value_times: Array, values: Array, begin: Array, end: Array, time: float
 ) -> Array:
-    """Average over intervals what follows T with one relaxation time, ``y' = (T - y) / t``.
-
-    Parameters
-    ----------
-    value_times, values, begin, end, time : ndarray, float
-        As for `mean_changes`.
-
-    Returns
-    -------
-    ndarray, shape (w,)
-        Means of y [unit of T].
+    """Average what follows T with one relaxation time, ``y' = (T - y) / t``, as `mean_changes`.
 
     Examples
     --------
@@ -179,33 +167,10 @@ def mean_followed(
     array([0.905, 2.9  ])
     """
     at, line = _polygon_corners(value_times, values, begin, end)
-    followed = _follow_values(at, line, time)
+    means = (line[1:] + line[:-1]) / 2.0
     # the integral of y is that of T less t times the growth of y
-    integral = _integrate_polygon(at, line) - time * followed
+    integral = _integrate_steps(at, means) - time * _follow_values(at, line, time)
     return _average_growth(at, integral, begin, end)
-
-
-def mean_rates(value_times: Array, values: Array, begin: Array, end: Array) -> Array:
-    """Average the rate of change over intervals, with T straight between few values.
-
-    Parameters
-    ----------
-    value_times, values, begin, end : ndarray
-        As for `mean_changes`.
-
-    Returns
-    -------
-    ndarray, shape (w,)
-        Means of T' [unit of T s-1].
-
-    Examples
-    --------
-    >>> t, T = np.array([5.0, 15.0]), np.array([1.0, 3.0])
-    >>> mean_rates(t, T, np.array([0.0, 10.0]), np.array([10.0, 20.0]))
-    array([0.2, 0.2])
-    """
-    at, line = _polygon_corners(value_times, values, begin, end)
-    return _average_growth(at, line, begin, end)
 
 
 def _polygon_corners(
@@ -228,9 +193,9 @@ def _average_growth(at: Array, values: Array, begin: Array, end: Array) -> Array
     )
 
 
-def _integrate_polygon(at: Array, values: Array) -> Array:
-    """Integrate a polygon from its first corner to each."""
-    return np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2.0 * np.diff(at))])
+def _integrate_steps(at: Array, means: Array) -> Array:
+    """Integrate a curve from its first corner to each, from its means between corners."""
+    return np.concatenate([[0.0], np.cumsum(means * np.diff(at))])
 
 
 @njit(**KERNEL)
@@ -266,18 +231,9 @@ def apply_dead_band(values: Array, width: float, start: float) -> tuple[Array, f
 def mean_dead_band_distance(
     value_times: Array, values: Array, begin: Array, end: Array, width: float
 ) -> Array:
-    """Average the distance of T from the output of `apply_dead_band`, with T straight.
+    """Average the distance of T from the output of `apply_dead_band`, as `mean_changes`.
 
-    Parameters
-    ----------
-    value_times, values, begin, end : ndarray
-        As for `mean_changes`; the output begins at T at the first time.
-    width : float
-        Half-width of the dead band.
-
-    Returns
-    -------
-    ndarray, shape (w,)
+    `width` is the half-width of the dead band, whose output begins at T at the first time.
 
     Examples
     --------
@@ -292,5 +248,4 @@ def mean_dead_band_distance(
     change, growth = np.diff(line), np.diff(distance)
     share = np.divide(growth, change, out=np.zeros(change.size), where=change != 0.0)
     means = distance[1:] - share * growth / 2.0
-    total = np.concatenate([[0.0], np.cumsum(means * np.diff(at))])
-    return _average_growth(at, total, begin, end)
+    return _average_growth(at, _integrate_steps(at, means), begin, end)

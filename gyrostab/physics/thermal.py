@@ -181,7 +181,7 @@ class Shupe(Effect):
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict window means from the temperature at its finest resolution, linearly joined."""
-        from gyrostab.kernels.thermal import mean_rates, slab
+        from gyrostab.kernels.thermal import mean_changes, slab
 
         times, whole, halves = slab(self.lag, int(self.modes))
         at, temperature = windows.course("temperature")
@@ -190,8 +190,8 @@ class Shupe(Effect):
         )
         if self.sensor_lag:
             ahead = (self.sensor_lag / times)[:, None]
-            modes = (1.0 - ahead) * modes + ahead * _MINUTE * mean_rates(
-                at, temperature, windows.begin, windows.end
+            modes = (1.0 - ahead) * modes + ahead * _MINUTE * mean_changes(
+                at, temperature, windows.begin, windows.end, 0.0
             )
         return Prediction(mean={"sensitivity": whole @ modes, "transient": halves @ modes})
 
