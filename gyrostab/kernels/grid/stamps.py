@@ -315,8 +315,38 @@ def _on_time(rows, stamps, j, n, period, hold, state, ring):  # type: ignore[no-
 
 
 @njit(**KERNEL)
-def _place_rows(rows, stamps, n, period, hold, max_gap, state, ring, runs, events):  # type: ignore[no-untyped-def]
-    """Run `place` into `runs` and `events`; returns the number of each."""
+def place(rows, stamps, n, period, hold, max_gap, state, ring):  # type: ignore[no-untyped-def]
+    """Assign rows to samples.
+
+    The next row takes the next sample while its stamp is within half a sample of it; otherwise the
+    sample is computed from the stamp, counted from the start of the piece, so errors do not
+    accumulate. Stamps are compared with their slow course along the grid (the phase), so that
+    jitter with a slightly wrong rate does not double or skip samples; only if the course is more
+    than `hold` off, one sample is left out, or one row.
+
+    Parameters
+    ----------
+    rows, stamps : ndarray of int64
+        Row numbers, rising, and stamps [ns] or `NO_STAMP`; up to `LOOK_AHEAD` more than `n`.
+    n : int
+        Rows to place; the others are only read ahead.
+    period : float
+        Sampling period [ns].
+    hold : float
+        Tolerance of the phase [samples].
+    max_gap : float
+        A longer step ahead is a step of the clock [samples].
+    state, ring : ndarray
+        From `new_state`, changed in place.
+
+    Returns
+    -------
+    runs : ndarray of int64, shape (n_runs, 3)
+        First sample, first row, length; the last run stays open in the state.
+    events : ndarray of int64, shape (n_events, 5)
+        Cause, sample, row, stamp before [ns], stamp [ns].
+    """
+    runs, events = np.empty((2 * n + 2, 3), np.int64), np.empty((2 * n + 2, 5), np.int64)
     n_runs, n_events = np.int64(0), np.int64(0)
     j = np.int64(-1)
     while True:
@@ -370,52 +400,4 @@ def _place_rows(rows, stamps, n, period, hold, max_gap, state, ring, runs, event
         state[_HEAD], state[_ROW] = target, row
         if verdict != _BY_COUNT:
             state[_LATEST] = max(state[_LATEST], stamp)
-    return n_runs, n_events
-
-
-def place(
-    rows: Integers,
-    stamps: Integers,
-    n: int,
-    period: float,
-    hold: float,
-    max_gap: float,
-    state: Integers,
-    ring: NDArray[np.bool_],
-) -> tuple[Integers, Integers]:
-    """Assign rows to samples.
-
-    The next row takes the next sample while its stamp is within half a sample of it; otherwise the
-    sample is computed from the stamp, counted from the start of the piece, so errors do not
-    accumulate. Stamps are compared with their slow course along the grid (the phase), so that
-    jitter with a slightly wrong rate does not double or skip samples; only if the course is more
-    than `hold` off, one sample is left out, or one row.
-
-    Parameters
-    ----------
-    rows, stamps : ndarray of int64
-        Row numbers, rising, and stamps [ns] or `NO_STAMP`; up to `LOOK_AHEAD` more than `n`.
-    n : int
-        Rows to place; the others are only read ahead.
-    period : float
-        Sampling period [ns].
-    hold : float
-        Tolerance of the phase [samples].
-    max_gap : float
-        A longer step ahead is a step of the clock [samples].
-    state, ring : ndarray
-        From `new_state`, changed in place.
-
-    Returns
-    -------
-    runs : ndarray of int64, shape (n_runs, 3)
-        First sample, first row, length; the last run stays open in the state.
-    events : ndarray of int64, shape (n_events, 5)
-        Cause, sample, row, stamp before [ns], stamp [ns].
-    """
-    runs = np.empty((2 * n + 2, 3), dtype=np.int64)
-    events = np.empty((2 * n + 2, 5), dtype=np.int64)
-    n_runs, n_events = _place_rows(
-        rows, stamps, n, period, hold, max_gap, state, ring, runs, events
-    )
     return runs[:n_runs].copy(), events[:n_events].copy()
