@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from gyrostab.kernels.allan.intervals import valid_intervals
 from gyrostab.kernels.compiled import INNER, KERNEL
 
 
@@ -72,44 +73,46 @@ def _pair_sum(n, k, moments):  # type: ignore[no-untyped-def]
     return n + 2.0 * (n * moments[0, last] - moments[1, last])
 
 
-@njit(**INNER)
-def strict_gap_factors(begin, end, counts, full, k, length, step, order, summed):  # type: ignore[no-untyped-def]
-    """Degrees of freedom of each window with gaps, as a share of the gap-free window's.
+@njit(**KERNEL)
+def strict_gap_factors(  # type: ignore[no-untyped-def]
+    starts, stops, window, step, ks, spans, order, summed, counts, full, out
+):
+    """Degrees of freedom of each window of a rate log, as a share of the gap-free window's.
 
     Parameters
     ----------
-    begin, end : int64 (n_intervals,)
-        Valid intervals of m of a rate log.
-    counts, full : int64 (n_windows,)
-        Terms used and terms without gaps.
-    k, length, step : int
-        Averaging factor, terms of a window without gaps, and step [samples].
+    starts, stops : int64 (n_runs,)
+        Runs of present samples.
+    window, step : int
+        Window and step [samples].
+    ks, spans : int64 (n_tau,)
+        Averaging factors, and samples that a term uses.
     order, summed : int, bool
         Order of the differences; whether they are those of the running sum of the angle.
-
-    Returns
-    -------
-    float64 (n_windows,)
-        1 where nothing is missing, 0 where nothing is left.
+    counts, full : float64 (n_windows, n_tau)
+        Terms used and terms without gaps.
+    out : float64 (n_windows, n_tau)
+        Overwritten where terms are missing, with 0 where none is left.
     """
-    moments = np.empty((2, 0)) if order == 2 else _third_pair_moments(k, summed)
-    out = np.ones(counts.size)
-    v = 0
-    for j in range(counts.size):
-        first = j * step
-        while v < begin.size and end[v] <= first:
-            v += 1
-        if counts[j] == full[j]:
-            continue
-        if counts[j] == 0:
-            out[j] = 0.0
-            continue
-        pairs = 0.0
-        for u in range(v, begin.size):
-            if begin[u] >= first + length:
-                break
-            a, b = max(begin[u], first), min(end[u], first + length)
-            pairs += _pair_sum(b - a, k, moments)
-        ratio = counts[j] / full[j]
-        out[j] = ratio * ratio * _pair_sum(int(full[j]), k, moments) / pairs
-    return out
+    for i in range(ks.size):
+        k, length = ks[i], window - spans[i] + 1
+        begin, end = valid_intervals(starts, stops, k, spans[i], np.int64(0))
+        moments = np.empty((2, 0)) if order == 2 else _third_pair_moments(k, summed)
+        v = 0
+        for j in range(counts.shape[0]):
+            first = j * step
+            while v < begin.size and end[v] <= first:
+                v += 1
+            if counts[j, i] == full[j, i]:
+                continue
+            if counts[j, i] == 0:
+                out[j, i] = 0.0
+                continue
+            pairs = 0.0
+            for u in range(v, begin.size):
+                if begin[u] >= first + length:
+                    break
+                a, b = max(begin[u], first), min(end[u], first + length)
+                pairs += _pair_sum(b - a, k, moments)
+            ratio = counts[j, i] / full[j, i]
+            out[j, i] = ratio * ratio * _pair_sum(int(full[j, i]), k, moments) / pairs

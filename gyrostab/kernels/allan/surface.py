@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.allan.blocks import (
@@ -33,11 +32,10 @@ from gyrostab.kernels.allan.integrate import (
     present_runs,
     sum_two,
 )
-from gyrostab.kernels.allan.intervals import single_blocks, valid_intervals
+from gyrostab.kernels.allan.intervals import single_blocks
 from gyrostab.kernels.allan.pairs import strict_gap_factors
 from gyrostab.kernels.allan.trend import difference_slopes
 from gyrostab.kernels.allan.variances import VARIANCES
-from gyrostab.kernels.compiled import KERNEL
 from gyrostab.kernels.workspace import Workspace
 
 NONE, STRICT, WEIGHTED = 0, 1, 2
@@ -110,25 +108,6 @@ class Cells(NamedTuple):
     ramp_response: Floats
     #: Slope of the rate per sample as the second differences show it; NaN in windows without gaps.
     difference_trend: Floats
-
-
-@njit(**KERNEL)
-def _share_gaps(  # type: ignore[no-untyped-def]
-    starts, stops, angle, window, step, ks, spans, order, summed, counts, full, cells
-):
-    """Degrees of freedom of the strict cells, as a share of the gap-free ones."""
-    for i in range(ks.size):
-        if angle:
-            for j in range(counts.shape[0]):
-                cells[3, j, i] = counts[j, i] / full[j, i]
-            continue
-        begin, end = valid_intervals(starts, stops, ks[i], spans[i], np.int64(0))
-        length = window - spans[i] + 1
-        factors = strict_gap_factors(
-            begin, end, counts[:, i], full[:, i], ks[i], length, step, order, summed
-        )
-        for j in range(factors.size):
-            cells[3, j, i] = factors[j]
 
 
 class _Work(NamedTuple):
@@ -283,15 +262,17 @@ def _empty_cells(n_windows: int, n_tau: int) -> tuple[Cells, Floats]:
 
 def _cells_with_gaps(work: _Work, sums: Floats, counts: Floats, full: Floats) -> Cells:
     """Compute the cells from the scaled sums of squares in unbroken runs, and their counts."""
-    unit, starts, stops = work.unit, work.starts, work.stops
+    unit = work.unit
     cells = np.ones((len(Cells._fields), *counts.shape))
     with np.errstate(invalid="ignore", divide="ignore"):
         np.divide(sums, counts, out=cells[0])
     cells[1], cells[2], cells[4] = counts, counts / full, STRICT
-    order = (unit.spans, unit.order, VARIANCES[unit.variance].summed)
-    _share_gaps(
-        starts, stops, unit.angle, unit.window, unit.step, unit.ks, *order, counts, full, cells
-    )
+    if unit.angle:
+        cells[3] = counts / full
+    else:
+        terms = unit.ks, unit.spans, unit.order, VARIANCES[unit.variance].summed
+        runs = work.starts, work.stops, unit.window, unit.step
+        strict_gap_factors(*runs, *terms, counts, full, cells[3])
     cells[8] = _find_slopes(work, counts < full)
     poor = counts < unit.min_strict * full
     if unit.order == 2 and not unit.angle and poor.any():
