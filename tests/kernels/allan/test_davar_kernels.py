@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gyrostab.kernels.allan import plain_sums, vectors
 from gyrostab.kernels.allan.integrate import integrate, present_runs
 from gyrostab.kernels.allan.plain_sums import CONSECUTIVE_LAGS, LANES
 from gyrostab.kernels.allan.surface import Unit, surface_unit
-from gyrostab.kernels.allan.vectors import split_sums
 from gyrostab.kernels.workspace import Workspace
 
 
 class TestKernels:
+    @pytest.mark.parametrize("module", [vectors, plain_sums])
     @given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.booleans(), st.integers(1, 200))
-    def test_sums_of_several_lags_in_one_pass(self, seed, count, in_a_row, longest):
+    def test_sums_of_several_lags_in_one_pass(self, module, seed, count, in_a_row, longest):
         rng = np.random.default_rng(seed)
         if in_a_row:
             count = CONSECUTIVE_LAGS if count > 2 else 4
@@ -34,7 +39,7 @@ class TestKernels:
         end = first + (sizes + 2 * used).max()
         theta[first:end] = rng.standard_normal(end - first)
         heads, tails = np.full((2, count + 4), 7.0)
-        split_sums(theta, first, count, lags, 2, splits, sizes, heads, tails, place)
+        module.split_sums(theta, first, count, lags, 2, splits, sizes, heads, tails, place)
         for i, (k, split, size) in enumerate(zip(used, splits, sizes, strict=True)):
             m = first + np.arange(size)
             squares = (theta[m + 2 * k] - 2 * theta[m + k] + theta[m]) ** 2
@@ -82,3 +87,15 @@ class TestKernels:
                 surface_unit(x, unit), surface_unit(x, unit, space), strict=True
             ):
                 np.testing.assert_array_equal(fresh, used)
+
+    def test_blocks_use_the_plain_loop_where_the_vectors_cannot_be_imported(self):
+        code = (
+            "import sys\n"
+            "sys.modules['gyrostab.kernels.allan.vectors'] = None\n"
+            "from gyrostab.kernels.allan import blocks\n"
+            "print(blocks.split_sums.py_func.__module__)"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=False
+        )
+        assert done.stdout.strip() == "gyrostab.kernels.allan.plain_sums", done.stderr
