@@ -662,31 +662,6 @@ def test_limit_of_a_cell_is_the_smallest_of_all_cells(quantile_curve, decades):
             assert got[w, a] == pytest.approx(avar[w, best] * reach[w, best, a], rel=1e-6)
 
 
-def test_table_of_products_is_the_sum_over_all_pairs_of_terms():
-    """Compare random walk with covariances from the weights of the second differences."""
-    window, ks = 90, np.array([1, 3, 8, 20])
-    walk = np.tril(np.ones((window, window)))
-    differences = []
-    for k in ks:
-        rows = [
-            np.concatenate([np.zeros(m), -np.ones(k), np.ones(k), np.zeros(window - m - 2 * k)])
-            for m in range(window - 2 * k + 1)
-        ]
-        differences.append(np.array(rows))
-    got, _ = product_tables(window, ks)
-    for i, first in enumerate(differences):
-        for j, second in enumerate(differences):
-            white_part = first @ second.T / (2.0 * ks[i] * ks[j])
-            assert got[1, 1, i, j] == pytest.approx(2 * np.mean(white_part**2), rel=1e-9)
-            # the average over each interval of a Brownian motion: half of the step in it, and a
-            # separate part
-            ends = walk - 0.5 * np.eye(window)
-            spread = ends @ ends.T + np.eye(window) / 12
-            walk_part = first @ spread @ second.T / (2.0 * ks[i] * ks[j])
-            assert got[3, 3, i, j] == pytest.approx(2 * np.mean(walk_part**2), rel=1e-9)
-            assert got[1, 3, i, j] == pytest.approx(2 * np.mean(white_part * walk_part), rel=1e-9)
-
-
 @pytest.mark.parametrize(("variance", "terms"), [("hadamard", "QNBKR"), ("avar", "QNBK")])
 def test_a_fit_without_a_ramp_needs_no_tables_of_trends(monkeypatch, variance, terms):
     monkeypatch.setattr(window_fit, "detrend_tables", lambda *_, **__: pytest.fail("made"))

@@ -1,4 +1,4 @@
-"""The covariance of detrended Allan variances, against sums over all pairs and simulation."""
+"""The covariance of Allan variances, also less their trend, against sums over all pairs."""
 
 from __future__ import annotations
 
@@ -32,6 +32,19 @@ def covariance_of(term):
         return np.eye(WINDOW)
     ends = np.tril(np.ones((WINDOW, WINDOW))) - 0.5 * np.eye(WINDOW)
     return ends @ ends.T + np.eye(WINDOW) / 12
+
+
+def test_table_of_products_is_the_sum_over_all_pairs_of_terms():
+    """Compare with covariances from the weights of the second differences."""
+    got, _ = product_tables(WINDOW, KS)
+    differences = [weights_of(k) / (np.sqrt(2.0) * k) for k in KS]
+    for i, first in enumerate(differences):
+        for j, second in enumerate(differences):
+            parts = {term: first @ covariance_of(term) @ second.T for term in (0, 1, 3)}
+            for a, one in parts.items():
+                for b, other in parts.items():
+                    expected = 2 * np.mean(one * other)
+                    assert got[a, b, i, j] == pytest.approx(expected, rel=1e-9), (a, b)
 
 
 @pytest.mark.parametrize("term", [0, 1, 3])
