@@ -23,7 +23,7 @@ from gyrostab.units import HOUR
 
 Floats = NDArray[np.float64]
 
-#: Variables by axis, window and averaging time, in the order in which `compute_unit` returns them.
+#: Variables by axis, window and averaging time, in the order in which `_compute_unit` returns them.
 CELL_FIELDS = (*Cells._fields, "edf")
 #: Types of the variables that are not float64.
 FIELD_TYPES = {"count": np.int64, "estimator": np.int8, "outlier_count": np.int64}
@@ -34,7 +34,7 @@ TREND_RESPONSES = (
     "trend_flicker_response",
     "trend_walk_response",
 )
-#: Variables by axis and window, in the order in which `compute_unit` returns them.
+#: Variables by axis and window, in the order in which `_compute_unit` returns them.
 PLANE_FIELDS = (
     "window_mean",
     "window_coverage",
@@ -47,7 +47,7 @@ PLANE_FIELDS = (
 _MAX_SAMPLES_READ_AT_ONCE = 2**21
 
 
-def read_spans(
+def _read_spans(
     data: Any, spans: Sequence[tuple[int, int]], space: Workspace
 ) -> Iterator[NDArray[np.generic]]:
     """Read the samples of each span, axis by axis; use each result before asking for the next.
@@ -74,7 +74,7 @@ def read_spans(
             yield from (samples[first - begin : last - begin] for first, last in spans)
 
 
-def compute_unit(
+def _compute_unit(
     x: NDArray[np.generic], unit: Unit, tables: NoiseTables, space: Workspace | None = None
 ) -> tuple[list[Floats], Floats]:
     """Compute one unit: the fields of the cells, see `Cells`, and plane fields (9, n_windows)."""
@@ -92,17 +92,27 @@ def compute_unit(
 def _compute_in_thread(
     x: NDArray[np.generic], unit: Unit, tables: NoiseTables, spaces: Workspaces
 ) -> tuple[list[Floats], Floats]:
-    """`compute_unit` with the working memory of the calling thread."""
-    return compute_unit(x, unit, tables, spaces.own)
+    """`_compute_unit` with the working memory of the calling thread."""
+    return _compute_unit(x, unit, tables, spaces.own)
 
 
 def _stack_unit(x: NDArray[np.generic], unit: Unit, tables: NoiseTables) -> tuple[Floats, Floats]:
-    """`compute_unit` with all fields in one array (10, n_windows, n_tau)."""
-    fields, means = compute_unit(x, unit, tables)
+    """`_compute_unit` with all fields in one array (10, n_windows, n_tau)."""
+    fields, means = _compute_unit(x, unit, tables)
     return np.stack(np.broadcast_arrays(*fields)), means
 
 
-def join_units(
+def compute_windows(
+    plan: Plan, groups: Sequence[slice], space: Workspace
+) -> tuple[list[NDArray[Any]], Floats]:
+    """Compute groups of windows, as `run_units` does, immediately and in the calling thread."""
+    unit, tables = plan.unit, make_noise_tables(plan)
+    spans = [(group.start * unit.step, last_sample(group, unit)) for group in groups]
+    samples = _read_spans(plan.signal.data, spans, space)
+    return _join_units([_compute_unit(x, unit, tables, space) for x in samples], plan)
+
+
+def _join_units(
     results: Sequence[tuple[list[Floats], Floats]], plan: Plan
 ) -> tuple[list[NDArray[Any]], Floats]:
     """Join units, axis by axis: fields (axis, time, tau), plane fields (9, axis, time).
@@ -145,15 +155,15 @@ def _trend_scale(unit: Unit) -> float:
     return float((HOUR / unit.interval) ** (2 if unit.angle else 1))
 
 
-def run_units(data: Any, plan: Plan) -> tuple[Any, Any]:
+def run_units(plan: Plan) -> tuple[Any, Any]:
     """Run the units of work: fields (axis, time, tau), plane fields (9, axis, time).
 
-    The results are dask arrays if `data` is one.
+    The results are dask arrays if the signal is one.
     """
-    lazy, unit, tables = isinstance(data, da.Array), plan.unit, make_noise_tables(plan)
+    data, unit, tables = plan.signal.data, plan.unit, make_noise_tables(plan)
     units = units_of_work(data.shape[1], unit)
     spans = [slice(part.start * unit.step, last_sample(part, unit)) for part in units]
-    if not lazy:
+    if not isinstance(data, da.Array):
         spaces = Workspaces()
         tasks = [
             partial(_compute_in_thread, data[row, span], unit, tables, spaces)
@@ -161,9 +171,9 @@ def run_units(data: Any, plan: Plan) -> tuple[Any, Any]:
             for span in spans
         ]
         if len(tasks) == 1:  # a short call does not wait for a graph
-            return join_units([tasks[0]()], plan)
+            return _join_units([tasks[0]()], plan)
         run = dask.compute(*(dask.delayed(task, pure=False)() for task in tasks))
-        return join_units(run, plan)
+        return _join_units(run, plan)
     shared = dask.delayed(tables, pure=True, traverse=False)
     work = dask.delayed(_stack_unit, nout=2, pure=False)
     rows_cells, rows_means = [], []

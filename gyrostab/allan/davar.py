@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -15,19 +15,10 @@ from gyrostab.allan.compute import (
     CELL_FIELDS,
     FIELD_TYPES,
     PLANE_FIELDS,
-    compute_unit,
-    join_units,
-    read_spans,
+    compute_windows,
     run_units,
 )
-from gyrostab.allan.freedoms import make_noise_tables
-from gyrostab.allan.plan import (
-    MOST_CELLS,
-    Plan,
-    last_sample,
-    make_plan,
-    units_of_work,
-)
+from gyrostab.allan.plan import MOST_CELLS, Plan, make_plan, units_of_work
 from gyrostab.errors import OptionError
 from gyrostab.ingest.convert import as_log
 from gyrostab.kernels.allan.variances import VARIANCES
@@ -136,7 +127,7 @@ def davar(
         log, window=window, step=step, taus=taus, tau_max=tau_max, axis=axis,
         min_strict=min_strict, min_coverage=min_coverage, variance=variance,
     )  # fmt: skip
-    cells, means = run_units(plan.signal.data, plan)
+    cells, means = run_units(plan)
     return _attach_labels(cells, means, log, plan)
 
 
@@ -220,18 +211,13 @@ def davar_part(
     """
     log = as_log(log)
     plan = make_plan(log, **options)
-    data, unit = plan.signal.data, plan.unit
-    tables = make_noise_tables(plan)
-    units = units_of_work(data.shape[1], unit)
+    units = units_of_work(plan.signal.sizes["time"], plan.unit)
     first, stop, hop = part.indices(units[-1].stop)
     if first >= stop or hop != 1:
         raise OptionError(f"part={part}: give a slice of windows 0 to {units[-1].stop - 1}")
     part = slice(first, stop)
     units = [windows for windows in units if windows.start < stop and windows.stop > first]
-    spans = [(windows.start * unit.step, last_sample(windows, unit)) for windows in units]
-    space = space or Workspace()
-    results = [compute_unit(x, unit, tables, space) for x in read_spans(data, spans, space)]
-    cells, means = join_units(results, plan)
+    cells, means = compute_windows(plan, units, space or Workspace())
     selected = slice(part.start - units[0].start, part.stop - units[0].start)
     return _attach_labels(
         [field[:, selected] for field in cells], means[:, :, selected], log, plan, part=part
@@ -247,16 +233,10 @@ def davar_sample(log: xr.Dataset, *, numbers: Sequence[int], **options: Any) -> 
     log = as_log(log)
     log = log.drop_vars(log_channels(log))
     plan, space = make_plan(log, **options), Workspace()
-    data, unit = plan.signal.data, plan.unit
-    tables = make_noise_tables(plan)
-    results = []
-    for number in numbers:
-        span = number * unit.step, last_sample(slice(number, number + 1), unit)
-        results.append(
-            [compute_unit(x, unit, tables, space) for x in read_spans(data, [span], space)]
-        )
-    cells, means = join_units(list(chain.from_iterable(zip(*results, strict=True))), plan)
-    return _attach_labels(cells, means, log, plan, numbers=numbers)
+    results = [compute_windows(plan, [slice(number, number + 1)], space) for number in numbers]
+    fields, means = zip(*results, strict=True)
+    cells = [np.concatenate(parts, axis=1) for parts in zip(*fields, strict=True)]
+    return _attach_labels(cells, np.concatenate(means, axis=2), log, plan, numbers=numbers)
 
 
 def _attach_labels(
