@@ -10,11 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
-
-Integers = NDArray[np.int64]
 
 #: Largest number of simultaneous hypotheses: each late row is the possible end of a loss.
 _MOST = 64

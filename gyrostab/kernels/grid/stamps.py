@@ -9,11 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
-
-Integers = NDArray[np.int64]
 
 #: Value of a stamp that could not be read (numpy's NaT as an integer).
 NO_STAMP = np.iinfo(np.int64).min
