@@ -219,51 +219,33 @@ class HeldSamples(Effect):
         first = previous_end + int(rng.geometric(min(1.0, self.per_hour / HOUR / rate)))
         count = int(rng.geometric(1.0 / max(1.0, self.length * rate)))
         if self.fill == "frame":
-            count = min(count, first, self._longest_frame(rate))
+            count = min(count, first, self._samples_kept(rate))
         return first, first + count
 
-    def _longest_frame(self, rate: float) -> int:
-        """Return the samples that are kept for a frame to be sent twice."""
-        return math.ceil(_FRAME_LENGTHS * max(1.0, self.length * rate))
+    def _samples_kept(self, rate: float) -> int:
+        """Return the samples that are kept to fill a loss: the last one, or the longest frame."""
+        longest = math.ceil(_FRAME_LENGTHS * max(1.0, self.length * rate))
+        return longest if self.fill == "frame" else 1
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         """Replace lost samples of the signal [degree hour-1]."""
-        rng, loss, last = state
-        if self.fill == "frame":
-            return self._send_frames_twice(chunk, rng, loss, last)
-        end = chunk.first + chunk.size
-        source = np.arange(chunk.size)
-        held = np.zeros(chunk.size, bool)
-        while loss is not None and loss[0] < end:
-            low, high = max(loss[0], chunk.first) - chunk.first, min(loss[1], end) - chunk.first
-            held[low:high] = True
-            source[low:high] = low - 1
-            if loss[1] > end:
-                break
-            loss = self._draw_loss(rng, loss[1], chunk.rate)
-        if self.fill == "zero":
-            return np.where(held, 0.0, chunk.signal), (rng, loss, None)
-        memory = chunk.signal[:, :1] if last is None else last
+        rng, loss, memory = state
+        kept = self._samples_kept(chunk.rate)
+        if memory is None:
+            memory = np.repeat(chunk.signal[:, :1], kept, axis=1)
         history = np.concatenate([memory, chunk.signal], axis=1)
-        signal = history[:, source + 1]
-        return signal, (rng, loss, signal[:, -1:].copy())
-
-    def _send_frames_twice(
-        self, chunk: Chunk, rng: np.random.Generator, loss: tuple[int, int] | None, last: Any
-    ) -> tuple[Array, Any]:
-        """Replace each loss by as many samples before it, of which `last` are known."""
-        longest = self._longest_frame(chunk.rate)
-        memory = np.zeros((chunk.signal.shape[0], longest)) if last is None else last
-        history = np.concatenate([memory, chunk.signal], axis=1)
-        end, offset = chunk.first + chunk.size, longest - chunk.first
+        end, offset = chunk.first + chunk.size, kept - chunk.first
         while loss is not None and loss[0] < end:
             low, high = max(loss[0], chunk.first) + offset, min(loss[1], end) + offset
-            count = loss[1] - loss[0]
-            history[:, low:high] = history[:, low - count : high - count]
+            if self.fill == "frame":
+                count = loss[1] - loss[0]
+                history[:, low:high] = history[:, low - count : high - count]
+            else:
+                history[:, low:high] = 0.0 if self.fill == "zero" else history[:, low - 1 : low]
             if loss[1] > end:
                 break
             loss = self._draw_loss(rng, loss[1], chunk.rate)
-        return history[:, longest:], (rng, loss, history[:, history.shape[1] - longest :].copy())
+        return history[:, kept:], (rng, loss, history[:, -kept:].copy())
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict a larger N, or window means biased towards zero."""

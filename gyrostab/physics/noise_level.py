@@ -218,6 +218,7 @@ class _FollowsVibration(Effect):
 
     stage = "noise"
     channels: ClassVar[Mapping[str, str]] = {"vibration": INNER["acceleration"]}
+    laws: ClassVar[Mapping[str, str]] = {}  # size -> symbol of the noise term that it raises
 
     exponent: float = parameter(
         "1", "power of the vibration with which the noise grows", default=1.0, low=0.1, high=4.0
@@ -226,6 +227,23 @@ class _FollowsVibration(Effect):
     def _raise_to_power(self, drivers: Mapping[str, Array]) -> Array:
         """Compute the vibration [g] to the power of the added variance."""
         return np.asarray(np.abs(drivers["vibration"]) ** (2.0 * self.exponent))
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
+        excited = self._raise_to_power(chunk.drivers)
+        return {
+            symbol: chunk.level[symbol] + getattr(self, name) ** 2 * excited
+            for name, symbol in self.laws.items()
+        }, state
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Predict the added spectra of independent noise on each axis."""
+        excited = self._raise_to_power(windows.drivers)[:, None]
+        return Prediction(
+            spectrum={
+                name: excited * sampled_psd(symbol, windows.frequency, windows.rate)
+                for name, symbol in self.laws.items()
+            }
+        )
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """List exponents."""
@@ -268,6 +286,7 @@ class VibrationNoise(_FollowsVibration):
         "separate noise from motion"
     )
     terms = "QN"
+    laws: ClassVar[Mapping[str, str]] = {"white": "N", "quantization": "Q"}
     size_parameters = ("white", "quantization")
     likeness: ClassVar[Mapping[str, Likeness]] = {"aliased_vibration": "any spectrum"}
 
@@ -283,26 +302,9 @@ class VibrationNoise(_FollowsVibration):
         "urad/g", "added Q, in squares, per rms g", default=0.0, typical=5.0, low=0.0, high=1e6
     )
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
-        excited = self._raise_to_power(chunk.drivers)
-        return {
-            "N": chunk.level["N"] + self.white**2 * excited,
-            "Q": chunk.level["Q"] + self.quantization**2 * excited,
-        }, state
-
-    def explain(self, windows: Windows) -> Prediction:
-        """Predict the added spectra of independent noise on each axis."""
-        excited = self._raise_to_power(windows.drivers)[:, None]
-        return Prediction(
-            spectrum={
-                name: excited * sampled_psd(symbol, windows.frequency, windows.rate)
-                for name, symbol in (("white", "N"), ("quantization", "Q"))
-            }
-        )
-
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        symbols = {"white": "N", "quantization": "Q"}
-        terms = [f"{self.quantity(name, errors)} of {symbols[name]}" for name in self.list_sizes()]
+        laws = self.laws
+        terms = [f"{self.quantity(name, errors)} of {laws[name]}" for name in self.list_sizes()]
         size = " and ".join(terms) or "nothing"
         return f"Vibration raises the noise {self.on_axes()}: {size}, {self._describe_law(errors)}."
 
@@ -333,25 +335,17 @@ class VibrationRandomWalk(_FollowsVibration):
         "a step does not"
     )
     terms = "K"
+    laws: ClassVar[Mapping[str, str]] = {"sensitivity": "K"}
     size_parameters = ("sensitivity",)
 
     sensitivity: float = parameter(
         "deg/h^1.5/g", "added K, in squares, per rms g", typical=0.5, low=0.0, high=1e4
     )
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
-        return {
-            "K": chunk.level["K"] + self.sensitivity**2 * self._raise_to_power(chunk.drivers)
-        }, state
-
     def explain(self, windows: Windows) -> Prediction:
-        """Predict the added spectrum of a random walk averaged over each sample."""
-        excited = self._raise_to_power(windows.drivers)[:, None]
-        walk = sampled_psd("K", windows.frequency, windows.rate)
-        return Prediction(
-            spectrum={"sensitivity": excited * walk},
-            wander={"sensitivity": (math.inf, excited[:, 0] / HOUR)},
-        )
+        """Predict the added spectrum of a random walk averaged over each sample, and the walk."""
+        growth = self._raise_to_power(windows.drivers) / HOUR
+        return replace(super().explain(windows), wander={"sensitivity": (math.inf, growth)})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         size = f"{self.quantity('sensitivity', errors)} of K, {self._describe_law(errors)}"
