@@ -114,7 +114,6 @@ class AgeingNoise(Effect):
         return {"N": chunk.level["N"] + base * (self.growth * hours**self.exponent)}, state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """List powers of time."""
         return {"exponent": np.array([0.5, 1.0, 2.0])}
 
     def explain(self, windows: Windows) -> Prediction:

@@ -111,7 +111,6 @@ class ClockError(Effect):
         return keep, None
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Sample the signal at the times of the clock [degree hour-1]."""
         keep, memory = state
         if not (self.error or self.drift):
             return chunk.signal, state

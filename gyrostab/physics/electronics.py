@@ -76,7 +76,6 @@ class SupplyBias(Effect):
     )
 
     def needs(self) -> tuple[str, ...]:
-        """List the channels with a nonzero sensitivity."""
         return ("supply_voltage",) * bool(self.voltage) + ("light_power",) * bool(self.power)
 
     def courses(self) -> tuple[str, ...]:
@@ -84,7 +83,6 @@ class SupplyBias(Effect):
         return self.needs() if self.lag else ()
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """Make an empty state."""
         return {}
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
@@ -135,7 +133,6 @@ class SupplyBias(Effect):
         return Prediction(mean=mean, spectrum={"ripple": spectrum}, coherent=True, line=place)
 
     def _average_channel(self, windows: Windows, name: str) -> Array:
-        """Average a lagged channel over the windows."""
         from gyrostab.kernels.thermal import mean_followed
 
         if not self.lag:
@@ -255,7 +252,6 @@ class Clipping(Effect):
     centre: float = parameter("deg/h", "middle of the range", default=0.0, limit=1e12)
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Clip the signal [degree hour-1]."""
         return self.transfer(chunk.signal), state
 
     def transfer(self, rate: Array) -> Array:

@@ -113,7 +113,6 @@ class FeedbackReset(Effect):
         return self.index * self.wavelength / self.diameter
 
     def needs(self) -> tuple[str, ...]:
-        """List the ramp, if its phase comes from the channel."""
         return ("ramp",) if self.phase == "channel" else ()
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
@@ -128,7 +127,6 @@ class FeedbackReset(Effect):
         return np.zeros(rows), None, np.zeros((rows, 1))
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Add the errors of the ramp to the signal [degree hour-1]."""
         turns, reading, tail = state
         if self.phase == "channel":
             ramp = chunk.drivers["ramp"] / self.full

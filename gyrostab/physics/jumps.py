@@ -261,7 +261,6 @@ class Telegraph(Effect):
         return {"low": times, "high": times}
 
     def explain(self, windows: Windows) -> Prediction:
-        """The spectrum of the samples."""
         share = self.high / (self.low + self.high)
         density = (
             share
@@ -354,7 +353,6 @@ class FringeHop(Effect):
         return [_Stepping(child, 0.0, _draw_wait(child, mean)) for child in children]
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Add the steps to the signal [degree hour-1]."""
         mean = (
             HOUR * chunk.rate / self.per_hour if self.per_hour and math.isinf(self.at) else math.inf
         )

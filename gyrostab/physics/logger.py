@@ -51,7 +51,6 @@ class RateQuantization(Effect):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Quantize the signal [degree hour-1]."""
         if self.step == 0.0:
             return chunk.signal, state
         count = chunk.signal / self.step
@@ -116,7 +115,6 @@ class Spikes(Effect):
     size: float = parameter("deg/h", "rms of an outlier", default=100.0, low=0.0, high=1e12)
 
     def _sample_probability(self, rate: float) -> float:
-        """Compute the probability that a sample is wrong."""
         return min(1.0, self.per_hour / HOUR / rate)
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
@@ -128,7 +126,6 @@ class Spikes(Effect):
         ]
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Corrupt samples of the signal [degree hour-1]."""
         signal, chance, new_state = chunk.signal.copy(), self._sample_probability(chunk.rate), []
         for row, (child, following) in enumerate(state):
             while following is not None and following < chunk.first + chunk.size:
@@ -228,7 +225,6 @@ class HeldSamples(Effect):
         return longest if self.fill == "frame" else 1
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Replace lost samples of the signal [degree hour-1]."""
         rng, loss, memory = state
         kept = self._samples_kept(chunk.rate)
         if memory is None:

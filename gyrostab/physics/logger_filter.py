@@ -100,7 +100,6 @@ class LoggerFilter(Effect):
         return sections, None, taps, None
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Filter and decimate the signal [degree hour-1]."""
         sections, inner, taps, memory = state
         signal = chunk.signal
         if sections is not None:

@@ -246,11 +246,9 @@ class _FollowsVibration(Effect):
         )
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """List exponents."""
         return {"exponent": np.array([0.5, 1.0, 2.0])}
 
     def _describe_law(self, errors: Mapping[str, float] | None) -> str:
-        """Describe how the sizes add up and grow."""
         if self.exponent == 1.0:
             return "added in squares"
         return f"added in squares, as vibration to the power {self.quantity('exponent', errors)}"

@@ -56,7 +56,6 @@ class DeadZone(Effect):
     )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Apply the dead zone to the signal [degree hour-1]."""
         if self.width == 0.0:
             return chunk.signal, state
         slow = chunk.signal
@@ -70,7 +69,6 @@ class DeadZone(Effect):
         return chunk.signal + self._zone_change(slow), state
 
     def _zone_change(self, rate: Array) -> Array:
-        """Return what the zone adds at each rate."""
         away = rate - self.centre
         inside = np.clip(away, -self.width, self.width)
         return (

@@ -289,7 +289,6 @@ class RealMotion(Effect):
         return direction * motion, (process, tilt)
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """List frequencies and qualities of the sway."""
         return {"frequency": windows.frequency, "quality": np.array([5.0, 20.0, 80.0])}
 
     def explain(self, windows: Windows) -> Prediction:

@@ -276,11 +276,9 @@ class ThermalGradient(Effect):
         return self.sensitivity * difference + _MINUTE * self.change * felt[0], state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
-        """List lags of the change."""
         return {"lag": np.append(_NO_LAG_S, np.geomspace(10.0, 1000.0, 5))}
 
     def explain(self, windows: Windows) -> Prediction:
-        """Predict window means of the difference and of its change."""
         difference = windows.drivers["temperature"] - windows.drivers["temperature_2"]
         at, first, second = windows.course("temperature", "temperature_2")
         return Prediction(

@@ -34,7 +34,6 @@ class _Vector(Effect):
     """Bias that is the scalar product of a vector channel with the parameters x, y, z."""
 
     def needs(self) -> tuple[str, ...]:
-        """List the components with a nonzero sensitivity."""
         return tuple(channel for channel in self.channels if getattr(self, channel[-1]))
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
@@ -44,7 +43,6 @@ class _Vector(Effect):
         return bias, state
 
     def explain(self, windows: Windows) -> Prediction:
-        """Predict window means from the present components."""
         return Prediction(
             mean={
                 name[-1]: windows.drivers[name] for name in self.channels if name in windows.drivers
@@ -143,7 +141,6 @@ class VibrationRectification(Effect):
         return square * (self.sensitivity + square * self.quartic), state
 
     def explain(self, windows: Windows) -> Prediction:
-        """Predict window means from the mean square of the vibration, and its square."""
         square = windows.drivers["vibration"] ** 2
         return Prediction(mean={"sensitivity": square, "quartic": square**2})
 
@@ -230,7 +227,6 @@ class AliasedVibration(Effect):
             )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """Draw the stationary state of the process."""
         from gyrostab.kernels.random.coloured import band, begin_process
 
         average, mount = self.sampling == "average", (self.resonance, self.quality)

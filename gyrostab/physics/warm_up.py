@@ -101,7 +101,6 @@ class WarmUp(Effect):
         ]
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        """Compute the rate contribution [degree hour-1], averaged over every sample."""
         on, shares = state
         which = (
             np.searchsorted(

@@ -237,7 +237,6 @@ class _Joined(RowSource):
         self.shape = (self.edges[-1],)
 
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
-        """Read samples of one row from `begin` on into `out`."""
         done, piece = 0, bisect_right(self.edges, begin) - 1
         while done < out.size:
             remaining = self.edges[piece + 1] - begin - done
@@ -292,7 +291,6 @@ class _Selected(RowSource):
         self.row, self.begin = row, begin
 
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
-        """Read samples of one row from `begin` on into `out`."""
         source_row = row if self.row is None else self.row
         read_into(self.parts[0], source_row, self.begin + begin, out)
 

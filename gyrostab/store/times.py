@@ -120,7 +120,6 @@ class _GridStamps(RowSource):
         self.shape, self.dtype = (grid.size,), np.dtype(np.int64)
 
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
-        """Compute the stamps of the samples from `begin` on."""
         grid = self.grid
         samples = grid.first + grid.stride * np.arange(begin, begin + out.size)
         np.floor_divide(grid_times(grid.start, grid.rate, samples), self.divisor, out=out)
