@@ -251,13 +251,6 @@ def test_wrong_calls_are_refused(axes, name, options, error, tmp_path):
         to_iscwsa(make_product(axes), tmp_path / name, **options)
 
 
-def test_existing_file_is_replaced_only_on_request(tmp_path):
-    to_iscwsa(make_product(), tmp_path / "tool.csv")
-    with pytest.raises(OutputError):
-        to_iscwsa(make_product(), tmp_path / "tool.csv")
-    to_iscwsa(make_product(), tmp_path / "tool.csv", overwrite=True)
-
-
 class TestCommand:
     @pytest.fixture
     def product(self, tmp_path) -> Path:

@@ -491,16 +491,6 @@ def test_diagnoses_at_addresses_are_those_of_their_runs(memory, archive, tmp_pat
     assert "1 of 1 diagnosed runs" in page
 
 
-def test_the_command_line_tells_the_failures(archive, tmp_path, capfd):
-    output = tmp_path / "fleet"
-    arguments = ["fleet", str(archive), "-o", str(output), "--window", "60s", "--no-reports"]
-    assert main([*arguments, "--scheduler", "threads", "--quiet-progress"]) == 2
-    shown = capfd.readouterr().err
-    assert "note: tool 2/broken: " in shown
-    assert "1 of 3 runs failed" in shown
-    assert "Traceback" not in shown
-
-
 # ------------------------------------------------------------------------------
 # stopped and killed
 

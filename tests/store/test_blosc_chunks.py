@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 import zarr
 
-from gyrostab import davar, make_log, open_log, open_product, read_log, scan, to_zarr
+from gyrostab import davar, make_log, open_product, read_log, scan, to_zarr
 from gyrostab.allan.fit import fit_noise
 from gyrostab.errors import FormatError
 from gyrostab.store.blosc_chunks import check_blosc_chunks, is_blosc_cut
@@ -100,15 +100,6 @@ def test_files_that_the_library_is_writing_are_no_damage(tmp_path: Path) -> None
     assert find_foreign_item(path) is None
     (path / "avar" / "0.0.partial").touch()
     assert find_foreign_item(path) == "avar/0.0.partial"
-
-
-def test_cut_chunk_of_the_samples_of_an_own_log_is_a_gap(tmp_path: Path) -> None:
-    log = make_log(np.arange(300_000.0) % 7, rate=100.0, unit="deg/h")
-    path = to_zarr(log, tmp_path / "log.zarr")
-    chunk = chunk_files(path, "rate")[-1]
-    chunk.write_bytes(chunk.read_bytes()[:-1])
-    with pytest.warns(UserWarning, match="taken as missing"):
-        assert int(open_log(path)["rate"].isnull().sum()) > 1000
 
 
 def test_stores_without_blosc_pass(tmp_path: Path) -> None:

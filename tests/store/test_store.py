@@ -19,7 +19,7 @@ from gyrostab.io import datasets
 from gyrostab.io.datasets import to_netcdf, to_zarr
 from gyrostab.io.opening import open_log
 from gyrostab.kernels.encoding.counts import from_counts, to_counts
-from gyrostab.time.grid import TimeGridIndex, grid_times
+from gyrostab.time.grid import TimeGridIndex
 from tests.support import synthetic
 from tests.support.stored import (
     CHUNK,
@@ -192,19 +192,6 @@ def test_a_value_that_stands_for_missing_is_not_lost(tmp_path):
     with pytest.warns(UserWarning, match="stored as doubles"):
         path = to_netcdf(log, tmp_path / "log.nc")
     assert same_bits(open_log(path).rate, log.rate)
-
-
-@pytest.mark.parametrize("form", WRITERS)
-@pytest.mark.parametrize("rate", [300.0, 99.3])
-@pytest.mark.parametrize("part", [slice(7, None), slice(3, 900, 7), slice(None, None, 2)])
-def test_a_cut_log_keeps_its_exact_times(tmp_path, form, rate, part):
-    log = synthetic.log(samples=1000, rate=rate).isel(time=part)
-    with open_log(WRITERS[form](log, tmp_path / f"cut.{form}")) as back:
-        np.testing.assert_array_equal(
-            back.time.values,
-            grid_times(synthetic.START, rate, np.arange(1000)[part]).view("M8[ns]"),
-        )
-        assert same_bits(back.rate, log.rate)
 
 
 def test_samples_that_were_dropped_are_missing(tmp_path):

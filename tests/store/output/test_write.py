@@ -86,17 +86,6 @@ def test_unwritable_directory():
         shutil.rmtree(folder)
 
 
-def test_no_such_directory(tmp_path):
-    with pytest.raises(OutputError, match=r"nowhere/out\.nc': there is no directory"):
-        to_netcdf(synthetic.surface(windows=2), tmp_path / "nowhere" / "out.nc")
-
-
-def test_a_directory_is_not_replaced_by_a_file(tmp_path):
-    (tmp_path / "out.nc").mkdir()
-    with pytest.raises(OutputError, match="is a directory"):
-        to_netcdf(synthetic.surface(windows=2), tmp_path / "out.nc", overwrite=True)
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
 def test_an_interruption_leaves_nothing_behind(tmp_path, error):
     def fail(block):
