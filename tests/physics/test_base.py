@@ -6,6 +6,8 @@ from dataclasses import fields, is_dataclass
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.base import STAGES, Effect, Prediction, Windows
@@ -13,20 +15,11 @@ from gyrostab.physics.registry import effect_table, effects, make_effect
 from gyrostab.simulate import simulate
 from gyrostab.units import INNER
 from tests.support.effect_bench import build_effect, random_cuts, run, same_whatever_the_cuts
+from tests.support.simulated import TYPICAL
 
 EFFECTS = list(effects().values())
 SIZE, RATE = 3000, 10.0
 with_each_effect = pytest.mark.parametrize("kind", EFFECTS, ids=lambda kind: kind.name)
-_TYPICAL = {
-    "degree_Celsius": 60.0,
-    "g": 1.0,
-    "degree s-1": 360.0,
-    "V": 24.0,
-    "W": 1e-4,
-    "uT": 30.0,
-    "Pa": 1e7,
-    "1": 0.5,
-}
 
 
 def drivers(kind: type[Effect]) -> dict[str, np.ndarray]:
@@ -35,7 +28,7 @@ def drivers(kind: type[Effect]) -> dict[str, np.ndarray]:
     channels = {}
     for number, (name, unit) in enumerate(kind.channels.items()):
         shape = 1.0 + 0.3 * np.sin(2 * np.pi * t / (40.0 + 7 * number)) + 0.2 * (t > 120.0)
-        channels[name] = _TYPICAL[unit] * shape
+        channels[name] = TYPICAL[unit] * shape
     return channels
 
 
@@ -98,10 +91,60 @@ def test_zero_size_changes_nothing(kind):
         np.testing.assert_array_equal(done, given["signal"])
 
 
-@with_each_effect
-@pytest.mark.parametrize("seed", [1, 2])
-def test_chunks_do_not_matter(kind, seed):
-    same_whatever_the_cuts(kind.example(), random_cuts(seed, SIZE), **options(kind))
+#: Effects with more than their typical parameters.
+VARIANTS = [
+    {"name": "ageing_bias", "slope": 1.0, "logarithmic": 0.2},
+    {"name": "ageing_noise", "growth": 0.5, "exponent": 1.7},
+    {"name": "aliased_vibration", "sensitivity": [1, 2, 3], "resonance": 650,
+     "sampling": "average"},
+    {"name": "bias_jump", "restart": 0.2, "shock": 0.1, "shocks_per_hour": 900,
+     "step": [0.1, 0.0, -0.1], "at": 71.23},
+    {"name": "clock_error", "error": 30_000, "drift": -9000},
+    {"name": "clock_error", "error": -30_000, "reading": "average"},
+    {"name": "dead_zone", "width": 2.0, "bandwidth": 0.3, "edge": "jump"},
+    {"name": "earth_rate", "latitude": 30, "inclination": 50, "azimuth": 70},
+    {"name": "feedback_reset", "kick": 3.0, "tail": 40.0, "decay": 0.5, "sawtooth": 0.3},
+    {"name": "feedback_reset", "kick": 3.0, "tail": 40.0, "decay": 0.5, "sawtooth": 0.3,
+     "phase": "channel", "full": 1.5},
+    {"name": "fringe_hop", "per_hour": 600, "hold": 5},
+    {"name": "fringe_hop", "at": 33.33, "hold": 5},
+    {"name": "held_samples", "per_hour": 3600, "length": 0.8},
+    {"name": "held_samples", "per_hour": 3600, "length": 0.8, "fill": "frame"},
+    {"name": "held_samples", "per_hour": 3600, "length": 0.8, "fill": "zero"},
+    {"name": "light_power_noise", "thermal": 0.3, "shot": 0.3},
+    {"name": "logger_filter", "cutoff": 3.0, "order": 5, "length": 0.7},
+    {"name": "real_motion", "sway": 3, "spin": 0.2, "x": 0.1, "z": -0.3,
+     "direction": [1.0, 0.5, -0.5]},
+    {"name": "rotation_line", "amplitude": [1, 2, 3], "harmonics": 4, "phase": [1, 2, 3]},
+    {"name": "scale_factor", "linear": 30, "asymmetry": -10, "cubic": 0.5, "thermal": 2},
+    {"name": "shared_source", "N": [0.1, 0.2, -0.1], "bandwidth": 0.5},
+    {"name": "shupe", "sensitivity": 0.05, "transient": -0.3, "lag": 20},
+    {"name": "shupe", "sensitivity": 0.05, "transient": -0.3, "lag": 20, "sensor_lag": 15},
+    {"name": "spectral_line", "amplitude": 1, "frequency": 3.3, "quality": 30},
+    {"name": "spikes", "kind": "outlier", "per_hour": 9000},
+    {"name": "supply_bias", "voltage": 0.1, "ripple": 0.2, "frequency": 17.0},
+    {"name": "supply_bias", "voltage": 0.1, "lag": 7.0},
+    {"name": "telegraph", "step": 0.2, "low": 0.05, "high": 3.0},
+    {"name": "temperature_noise", "linear": 1e-3, "quadratic": 1e-5},
+    {"name": "thermal_gradient", "sensitivity": 0.05, "change": 0.2},
+    {"name": "thermal_hysteresis", "sensitivity": 0.01, "width": 0.5},
+    {"name": "vibration_noise", "white": 0.02, "quantization": 2.0, "exponent": 0.9},
+    {"name": "vibration_random_walk", "sensitivity": 0.7, "exponent": 1.3},
+    {"name": "warm_up", "amplitude": 0.3, "slow_amplitude": 0.1, "gap": 2.0, "cooling": 30},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [kind.example() for kind in EFFECTS] + [make_effect(table) for table in VARIANTS],
+    ids=lambda effect: effect.name,
+)
+@given(st.integers(0, 10_000), st.sampled_from([0.3, RATE, 977.0]))
+@settings(max_examples=6)
+def test_chunks_do_not_matter(effect, seed, rate):
+    given_rate = RATE if effect.name == "logger_filter" else rate  # its cutoff is in hertz
+    given_options = options(type(effect)) | {"rate": given_rate, "seed": seed}
+    same_whatever_the_cuts(effect, random_cuts(seed, SIZE), **given_options)
 
 
 @with_each_effect
@@ -207,7 +250,8 @@ def test_missing_channel_is_named(kind):
         return
     with pytest.raises(
         SchemaError,
-        match=f"effect '{kind.name}' needs the channel '{needs[0]}' .*add it to the environment",
+        match=f"effect '{kind.name}' needs the channel '{needs[0]}' .*; the log has no channels; "
+        "add it to the environment",
     ):
         simulate(model)
 

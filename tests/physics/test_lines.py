@@ -14,12 +14,7 @@ from gyrostab.physics.phase import fold
 from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
 from gyrostab.simulate.turning import rotation
-from tests.support.effect_bench import allan_of_density, build_effect, run, sigma
-
-
-def sinusoid_avar(amplitude, f, tau):
-    x = math.pi * f * np.asarray(tau)
-    return amplitude**2 * np.sin(x) ** 4 / x**2
+from tests.support.effect_bench import allan_of_density, build_effect, run, sigma, sinusoid_avar
 
 
 def test_a_steady_line_has_the_allan_variance_of_a_sinusoid():
@@ -30,7 +25,7 @@ def test_a_steady_line_has_the_allan_variance_of_a_sinusoid():
     taus = np.array([0.05, 0.25, 0.7, 1.0, 2.3, 5.0])
     for row, amplitude in ((0, 0.2), (1, 0.1)):
         np.testing.assert_allclose(
-            sigma(rates[row], 20.0, taus)[0] ** 2, sinusoid_avar(amplitude, 0.53, taus), rtol=0.01
+            sigma(rates[row], 20.0, taus)[0] ** 2, sinusoid_avar(taus, amplitude, 0.53), rtol=0.01
         )
     assert not rates[2].any()
     fine = np.arange(1, 40) * 0.05
@@ -131,4 +126,4 @@ def test_a_pump_is_another_channel():
     taus = [0.1, 0.371 / 2, 0.4]
     taus = [round(tau * 40) / 40 for tau in taus]
     variance = sigma(log.rate.sel(axis="x").values, 40.0, taus)[0] ** 2
-    np.testing.assert_allclose(variance, sinusoid_avar(0.3, 2.0, taus), rtol=0.01)
+    np.testing.assert_allclose(variance, sinusoid_avar(taus, 0.3, 2.0), rtol=0.01)

@@ -349,6 +349,4 @@ def test_a_frame_sent_twice_repeats_the_samples_before_it():
     as_before = [(late[low:high] == high - low).all() for low, high in runs]
     assert np.mean(as_before) > 0.95  # the others repeat a repeated sample
     assert np.mean([high - low for low, high in runs]) == pytest.approx(6.0, rel=0.2)
-    cut = run(effect, size=size, rate=10.0, axes="xy", signal=numbers, cuts=[3, 777, 778, 90_000])
-    np.testing.assert_array_equal(cut, sent)
     assert "filled with the frame before on all axes" in effect.say()

@@ -6,41 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from gyrostab.physics.base import Windows
 from gyrostab.physics.registry import make_effect
-from tests.support.effect_bench import build_effect, random_cuts, run, same_whatever_the_cuts
-
-
-def windows_of(rates, rate, length, drivers, own=None, frequency=None):
-    """Make adjacent windows with mean drivers (rms of vibration), and the means of the rates."""
-    n = rates.shape[1] // length
-    edges = np.arange(n + 1) * length / rate
-
-    def mean(values):
-        return (
-            np.broadcast_to(np.asarray(values, float), rates.shape[1])[: n * length]
-            .reshape(n, length)
-            .mean(axis=1)
-        )
-
-    reduced = {
-        name: np.sqrt(mean(np.square(values))) if name == "vibration" else mean(values)
-        for name, values in drivers.items()
-    }
-    windows = Windows(
-        begin=edges[:-1],
-        end=edges[1:],
-        frequency=np.geomspace(0.1, rate / 2, 12) if frequency is None else frequency,
-        rate=rate,
-        axes=("x", "y", "z"),
-        drivers=reduced,
-        own={axis: mean(values) for axis, values in (own or {}).items()},
-    )
-    return windows, np.stack([mean(row) for row in rates])
-
+from tests.support.effect_bench import build_effect, means_and_prediction, run, windows_of
 
 T = np.arange(4000) / 10.0
 SPEED = 2.0 + 0.5 * np.floor(T / 40.0) * (-1) ** np.floor(T / 80)
@@ -70,24 +38,16 @@ TRUE = {axis: 100.0 * np.cos(T / 60 + number) for number, axis in enumerate("xyz
     ids=lambda table: table["name"],
 )
 def test_window_means_are_the_design_times_the_parameters(table):
-    effect = make_effect(table)
-    rates = run(effect, size=4000, rate=10.0, drivers=DRIVERS, true=TRUE)
-    windows, means = windows_of(rates, 10.0, 400, DRIVERS, own=TRUE)
-    design = effect.explain(windows).mean
-    sizes = {name: np.atleast_1d(getattr(effect, name)) for name in design}
-    total = sum(
-        np.broadcast_to(values, means.shape) * sizes[name].reshape(-1, 1)
-        for name, values in design.items()
+    means, predicted, _ = means_and_prediction(
+        make_effect(table), rate=10.0, length=400, drivers=DRIVERS, true=TRUE, own=TRUE
     )
     assert np.abs(means).max() > 1e-3
-    np.testing.assert_allclose(total, means, atol=2e-3 * np.abs(means).max())
+    np.testing.assert_allclose(predicted, means, atol=2e-3 * np.abs(means).max())
 
 
 def test_tilt_leaves_the_slope_of_the_acceleration_in_the_means():
     effect = build_effect("real_motion", x=0.5, z=-0.2, direction=[1.0, -0.5, 0.2])
-    rates = run(effect, size=4000, rate=10.0, drivers=DRIVERS)
-    windows, means = windows_of(rates, 10.0, 100, DRIVERS)
-    design = effect.explain(windows).mean
+    means, _, design = means_and_prediction(effect, rate=10.0, length=100, drivers=DRIVERS)
     total = 0.5 * design["x"] - 0.2 * design["z"]
     np.testing.assert_allclose(total[:, 1:-1], means[:, 1:-1], atol=0.02 * np.abs(means).max())
 
@@ -118,7 +78,14 @@ def test_spectra_match_the_prediction(table):
     drivers = {"vibration": 2.0, "rotation_rate": 417.6}
     rates = run(effect, size=length * count, rate=rate, drivers=drivers, axes=("x", "y", "z"))
     centres = np.arange(1, 100) * 0.05
-    windows, _ = windows_of(rates, rate, length, drivers, frequency=centres)
+    windows = windows_of(
+        length * count,
+        rate,
+        length / rate,
+        centres,
+        axes=("x", "y", "z"),
+        drivers={name: np.full(count, value) for name, value in drivers.items()},
+    )
     power = np.abs(
         np.fft.rfft(rates[0].reshape(count, length) * np.sqrt(8 / 3) * np.hanning(length), axis=1)
     ) ** 2 / (length * rate)
@@ -136,49 +103,6 @@ def test_spectra_match_the_prediction(table):
     if prediction.line is not None:
         place = np.atleast_2d(prediction.line)[0, 0]
         assert place == pytest.approx(f[power.mean(axis=0).argmax()], abs=0.15)
-
-
-@given(
-    st.integers(0, 2**32 - 1),
-    st.sampled_from(["bent", "band", "resonance", "lines", "earth", "errors"]),
-)
-@settings(max_examples=24)
-def test_chunks_never_matter(seed, which):
-    table = {
-        "bent": {
-            "name": "real_motion",
-            "sway": 3,
-            "spin": 0.2,
-            "x": 0.1,
-            "z": -0.3,
-            "direction": [1.0, 0.5, -0.5],
-        },
-        "band": {
-            "name": "aliased_vibration",
-            "sensitivity": [1, 2, 3],
-            "resonance": 650,
-            "sampling": "average",
-        },
-        "resonance": {"name": "spectral_line", "amplitude": 1, "frequency": 3.3, "quality": 30},
-        "lines": {
-            "name": "rotation_line",
-            "amplitude": [1, 2, 3],
-            "harmonics": 4,
-            "phase": [1, 2, 3],
-        },
-        "earth": {"name": "earth_rate", "latitude": 30, "inclination": 50, "azimuth": 70},
-        "errors": {
-            "name": "scale_factor",
-            "linear": 30,
-            "asymmetry": -10,
-            "cubic": 0.5,
-            "thermal": 2,
-        },
-    }[which]
-    drivers = {name: values[:700] for name, values in DRIVERS.items()}
-    same_whatever_the_cuts(
-        make_effect(table), random_cuts(seed, 700), size=700, drivers=drivers, seed=seed
-    )
 
 
 @pytest.mark.parametrize(

@@ -102,34 +102,6 @@ def test_one_mode_of_shupe_is_a_simple_lag():
         np.testing.assert_allclose(down, -bias, atol=1e-12)
 
 
-def test_shupe_is_constant_on_a_ramp_and_steps_at_its_start():
-    world = [
-        {
-            "profile": "ramps",
-            "channel": "temperature",
-            "unit": "degC",
-            "points": [[0, 20], [2000, 20], [8000, 120]],
-        }
-    ]
-    effect = {"name": "shupe", "sensitivity": 0.2, "lag": 10, "axes": ["x"]}
-    log = simulate(
-        {
-            "environment": world,
-            "effect": [effect],
-            "noise": {},
-            "log": {"rate": 1, "duration": "8000s"},
-        }
-    )
-    surface = davar(log, window="2000s", step="1000s", taus=[50.0, 100.0, 300.0]).sel(axis="x")
-    step, tau = 0.2, surface.tau.values
-    expected = step**2 * tau / (3 * (2000 - 2 * tau))
-    np.testing.assert_allclose(surface.avar.values[1], expected, rtol=0.1)
-    k = math.sqrt(3 * surface.avar.values[1][1] / 100 * HOUR)
-    assert k == pytest.approx(step / math.sqrt(2000 / HOUR), rel=0.1)
-    assert np.all(surface.avar.values[3:] < 1e-12)
-    np.testing.assert_allclose(surface.window_mean.values[[0, 3, 5]], [0.0, 0.2, 0.2], atol=1e-9)
-
-
 def test_lagged_temperature_bias_equals_two_effects():
     """``y' = (T - y) / L`` equals a T and -a L of the lagged change of T."""
     t, a, lag = (np.arange(8000) - 2000) / 10.0, 0.02, 90.0
@@ -201,14 +173,7 @@ def test_temperature_ramp_is_a_rate_ramp_and_shupe_shifts_the_mean():
         {"name": "temperature_bias", "sensitivity": 0.01, "axes": ["x"]},
         {"name": "shupe", "sensitivity": 0.1, "lag": 5, "axes": ["y"]},
     ]
-    log = simulate(
-        {
-            "environment": world,
-            "effect": tables,
-            "noise": {},
-            "log": {"rate": 2, "duration": "60 min"},
-        }
-    )
+    log = simulate({"environment": world, "effect": tables}, duration="60 min", rate=2)
     surface = davar(log, window="5min", step="5min", taus=[5.0, 50.0])
     ramp = 0.01 * 2 * 60  # deg/h^2
     up, down = 3, 9  # 15 to 20 min and 45 to 50 min
@@ -317,14 +282,7 @@ def test_short_power_loss_restores_only_a_part():
 def test_warm_up_looks_like_a_rate_ramp_that_fades_after_every_restart():
     world = [{"profile": "power_cuts", "cuts": [[3000, 3060]]}]
     effect = {"name": "warm_up", "amplitude": 0.3, "time": 600, "axes": ["x"]}
-    log = simulate(
-        {
-            "environment": world,
-            "effect": [effect],
-            "noise": {},
-            "log": {"rate": 2, "duration": "6000s"},
-        }
-    )
+    log = simulate({"environment": world, "effect": [effect]}, duration="6000s", rate=2)
     surface = davar(log, window="100s", step="20s", taus=[5.0, 20.0]).sel(axis="x")
     t = np.arange(surface.sizes["time"]) * 20 + 50.0
     for begin, rows in ((0.0, (t > 0) & (t < 2900)), (3060.0, t > 3120)):
@@ -408,7 +366,7 @@ def test_mean_distance_from_a_dead_band_of_any_width(width):
 
 def test_a_bias_that_ages_steadily_is_a_rate_ramp():
     effect = {"name": "ageing_bias", "slope": 24.0, "axes": ["x"]}
-    log = simulate({"effect": [effect], "noise": {}, "log": {"rate": 1, "duration": "2h"}})
+    log = simulate({"effect": [effect]}, duration="2h", rate=1)
     taus = np.array([1.0, 60.0, 600.0])
     variance = avar(log.rate.sel(axis="x").values, 1.0, taus)[0]
     # 24 deg/h/day are 1 deg/h^2

@@ -7,22 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.kernels.thermal import mean_changes
 from gyrostab.noise import LAWS
 from gyrostab.physics.base import Windows
 from gyrostab.physics.registry import effects, make_effect
-from gyrostab.simulate import simulate
-from tests.support.effect_bench import (
-    allan_of_samples,
-    build_effect,
-    random_cuts,
-    run,
-    same_whatever_the_cuts,
-    steady,
-)
+from tests.support.effect_bench import allan_of_samples, build_effect, run
 
 RATE, LENGTH = 2.0, 7200
 _T = np.arange(int(LENGTH * RATE)) / RATE
@@ -224,70 +216,6 @@ def test_overlapping_windows_use_means_only():
     np.testing.assert_array_equal(values, means)
     at, values = replace(windows, end=begin + 30.0).course("a")
     np.testing.assert_allclose(at, 3.75 + 7.5 * np.arange(8))
-
-
-CASES = [
-    {"name": "shupe", "sensitivity": 0.05, "transient": -0.3, "lag": 20},
-    {"name": "shupe", "sensitivity": 0.05, "transient": -0.3, "lag": 20, "sensor_lag": 15},
-    {"name": "thermal_gradient", "sensitivity": 0.05, "change": 0.2},
-    {"name": "warm_up", "amplitude": 0.3, "slow_amplitude": 0.1, "gap": 2.0, "cooling": 30},
-    {"name": "thermal_hysteresis", "sensitivity": 0.01, "width": 0.5},
-    {"name": "ageing_bias", "slope": 1.0, "logarithmic": 0.2},
-    {"name": "temperature_noise", "linear": 1e-3, "quadratic": 1e-5},
-    {"name": "light_power_noise", "thermal": 0.3, "shot": 0.3},
-    {"name": "vibration_noise", "white": 0.02, "quantization": 2.0, "exponent": 0.9},
-    {"name": "vibration_random_walk", "sensitivity": 0.7, "exponent": 1.3},
-    {"name": "ageing_noise", "growth": 0.5, "exponent": 1.7},
-]
-
-
-@pytest.mark.parametrize("table", CASES, ids=lambda table: "-".join(map(str, table.values())))
-@given(st.integers(0, 2**31), st.sampled_from([0.3, 10.0, 977.0]))
-@settings(max_examples=8)
-def test_chunk_edges_do_not_matter(table, seed, rate):
-    rng = np.random.default_rng(seed)
-    size = 600
-    drivers = {
-        "temperature": 20 + np.cumsum(rng.normal(0, 0.3, size)),
-        "temperature_2": 20 + np.cumsum(rng.normal(0, 0.3, size)),
-        "vibration": np.abs(rng.normal(0, 3, size)),
-        "light_power": rng.uniform(1e-5, 1e-4, size),
-    }
-    effect = make_effect(table)
-    tables = {
-        "gaps": np.array([[50, 80], [200, 300], [420, 421]]),
-        "restarts": np.array([[200, 300]]),
-    }
-    noise = {"Q": 0.1, "N": [0.1, 0.2, 0.3], "B": 0.0, "K": 0.3}
-    given_drivers = {name: drivers[name] for name in effect.channels}
-    same_whatever_the_cuts(
-        effect,
-        random_cuts(seed, size),
-        size=size,
-        rate=rate,
-        drivers=given_drivers,
-        noise=noise,
-        **tables,
-    )
-
-
-def test_a_simulated_log_does_not_depend_on_its_chunks():
-    world = [
-        {"profile": "chamber", "speed": 5, "hold": 60},
-        {"profile": "vibration", "points": [[0, 1.0], [700, 3.0]]},
-        {"profile": "light_power", "loss": 500.0},
-        steady("temperature_2", "degC", 10),
-        {"profile": "power_cuts", "cuts": [[500, 540]]},
-    ]
-    model = {
-        "environment": world,
-        "effect": CASES,
-        "noise": {"N": 0.01},
-        "log": {"rate": 2, "duration": "1500s"},
-    }
-    whole, many = (simulate(model, seed=9, chunk=chunk).rate.values for chunk in (3000, 371))
-    np.testing.assert_array_equal(whole, many)
-    assert np.isnan(whole[:, 1000:1080]).all()
 
 
 @pytest.mark.parametrize(

@@ -190,18 +190,6 @@ def test_command_writes_a_log_that_run_takes(tmp_path, capsys):
     assert (open_log(second_log).time.values == log.time.values).all()
 
 
-def test_command_explains_a_wrong_model(tmp_path, capsys):
-    path = tmp_path / "m.toml"
-    path.write_text('[noise]\nN = 0.02\n[[effect]]\nname = "temperature_bias"\n')
-    assert (
-        call("simulate", path, "-o", tmp_path / "log.nc", "--duration", "1min", "--rate", "10") == 2
-    )
-    message = capsys.readouterr().err
-    assert "lacks the parameter 'sensitivity'" in message
-    assert "Traceback" not in message
-    assert not (tmp_path / "log.nc").exists()
-
-
 # --------------------------------------------------------------------------------
 # shipped models
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import quad
 
 from gyrostab.errors import OptionError
 from gyrostab.kernels.random.stochastic import RATIO, brownian_means, flicker_times
 from gyrostab.noise import LAWS, URAD_PER_S
 from gyrostab.simulate.noise import FLICKER_LOW, begin_noise, draw, make_noise, shape
+from tests.support.effect_bench import markov_avar, sinusoid_avar
 
 RATE = 50.0
 LENGTH, RECORDS = 500, 5000
@@ -28,20 +28,11 @@ def allan(records: np.ndarray, k: int, rate: float = RATE) -> float:
     return float((second**2).mean() / (2 * (k / rate) ** 2))
 
 
-def markov_avar(tau: np.ndarray | float, sigma: float, time: float) -> np.ndarray:
-    """Compute the Allan variance of a Gauss-Markov process, IEEE Std 952, q^2 T / 2 = sigma^2."""
-    x = np.asarray(tau, float) / time
-    exact = 2 / x * (1 - (3 - 4 * np.exp(-x) + np.exp(-2 * x)) / (2 * x))
-    return sigma**2 * np.where(x < 1e-3, 2 * x / 3 * (1 - 0.75 * x), exact)
-
-
 def laws(term: str, tau: np.ndarray) -> np.ndarray:
     if term == "gauss_markov":
         return markov_avar(tau, *MARKOV)
     if term == "sinusoid":
-        amplitude, frequency, _ = SINE
-        u = np.pi * frequency * tau
-        return amplitude**2 * np.sin(u) ** 4 / u**2
+        return sinusoid_avar(tau, *SINE[:2])
     return LAWS[term].avar(tau, SIZES[term])
 
 
@@ -87,37 +78,6 @@ def test_ensemble_spectrum_integrates_to_the_law(term, ensembles):
         weight = np.where(f == RATE / 2, 1.0, 2.0)
         variance = float((weight * density[1:] * transfer).sum() * RATE / 4000)
         assert variance == pytest.approx(float(laws(term, np.array(k / RATE))), rel=0.02), k
-
-
-@pytest.mark.parametrize("tau", [0.02, 0.3, 5.0])
-def test_gauss_markov_and_sinusoid_are_the_integral_of_their_spectra(tau):
-    """P16 Eq. 7: 4 int_0^inf S(f) sin^4(pi f tau) / (pi f tau)^2 df."""
-    sigma, time = MARKOV
-
-    def integrand(f):
-        return (
-            4
-            * 2
-            * sigma**2
-            * time
-            / (1 + (2 * np.pi * f * time) ** 2)
-            * np.sin(np.pi * f * tau) ** 4
-            / (np.pi * f * tau) ** 2
-        )
-
-    total = sum(quad(integrand, j / tau, (j + 1) / tau, epsrel=1e-9)[0] for j in range(300))
-    assert total == pytest.approx(float(markov_avar(tau, *MARKOV)), rel=1e-3)
-    # a line of amplitude A is A^2 / 4 at +f and at -f; the integral counts +f and doubles it twice
-    amplitude, frequency, _ = SINE
-    u = np.pi * frequency * tau
-    assert float(laws("sinusoid", np.array(tau))) == pytest.approx(
-        4 * amplitude**2 / 4 * np.sin(u) ** 4 / u**2, rel=1e-12
-    )
-
-
-def test_the_bump_of_a_sinusoid_is_at_0_371_over_its_frequency():
-    tau = np.linspace(0.1, 1.0, 20001) / SINE[1]
-    assert tau[np.argmax(laws("sinusoid", tau))] * SINE[1] == pytest.approx(0.371, abs=5e-4)
 
 
 @pytest.mark.parametrize("rate", [0.1, 10.0, 400.0, 2000.0])

@@ -127,13 +127,6 @@ def test_another_seed_gives_other_noise():
     )
 
 
-def test_a_slice_is_that_of_the_whole():
-    log = simulate(model(), chunk=200)
-    np.testing.assert_array_equal(
-        log.rate.isel(time=slice(950, 960)).values, log.rate.values[:, 950:960]
-    )
-
-
 def test_oversampling_keeps_the_noise_of_the_log():
     size = {"duration": "30min", "rate": 20.0}
     for factor in (1, 4):
@@ -168,19 +161,6 @@ def test_zero_size_changes_nothing_whatever_the_effect():
         np.testing.assert_array_equal(
             simulate(off, environment=world, seed=3).rate.values, before, err_msg=name
         )
-
-
-def test_each_effect_without_its_channel_says_so():
-    for name, kind in effects().items():
-        needs = kind.example().needs()
-        if not needs:
-            continue
-        bare = replace(read_model({"noise": {"N": 0.01}}), effects=(kind.example(),))
-        with pytest.raises(
-            SchemaError,
-            match=f"effect '{name}' needs the channel '{needs[0]}'.*the log has no channels",
-        ):
-            simulate(bare, duration="10s", rate=10.0)
 
 
 def test_a_channel_in_the_wrong_unit_is_refused():

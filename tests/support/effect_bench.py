@@ -138,6 +138,19 @@ def sigma(rates: Any, rate: float, taus: Sequence[float]) -> NDArray[np.float64]
     return np.sqrt(avar(rates, rate, taus))
 
 
+def markov_avar(tau: Any, rms: float, time: float) -> NDArray[np.float64]:
+    """Allan variance of a Gauss-Markov process, IEEE Std 952, annex C, with q^2 = 2 rms^2 / T_c."""
+    x = np.asarray(tau, float) / time
+    exact = 2.0 / x * (1.0 - (3.0 - 4.0 * np.exp(-x) + np.exp(-2.0 * x)) / (2.0 * x))
+    return rms**2 * np.where(x < 1e-3, 2.0 * x / 3.0 * (1.0 - 0.75 * x), exact)
+
+
+def sinusoid_avar(tau: Any, amplitude: float, frequency: float) -> NDArray[np.float64]:
+    """Allan variance of a sinusoid, IEEE Std 952, annex C."""
+    x = np.pi * frequency * np.asarray(tau, float)
+    return amplitude**2 * np.sin(x) ** 4 / x**2
+
+
 def allan_of_density(
     density: Callable[[NDArray[np.float64]], Any], tau: float, top: float
 ) -> float:
@@ -170,6 +183,43 @@ def windows_of(
     return Windows(
         edges[:-1], edges[1:], np.asarray(frequency, float), rate, more.pop("axes", ("x",)), **more
     )
+
+
+def means_and_prediction(
+    effect: Effect,
+    *,
+    rate: float,
+    length: int,
+    drivers: Mapping[str, Any],
+    own: Mapping[str, Any] | None = None,
+    true: Mapping[str, Any] | None = None,
+) -> tuple[Any, Any, Any]:
+    """Means over windows of `length` samples: of what the effect adds, as predicted, per unit.
+
+    `own` is the signal of the axes before the effect.
+    """
+
+    def reduce(channels: Mapping[str, Any]) -> dict[str, Any]:
+        blocks = {name: np.reshape(values, (-1, length)) for name, values in channels.items()}
+        return {
+            name: np.sqrt((rows**2).mean(axis=1)) if name == "vibration" else rows.mean(axis=1)
+            for name, rows in blocks.items()
+        }
+
+    own = own or {}
+    size = len(next(iter(drivers.values())))
+    signal = np.stack(list(own.values())) if own else 0.0
+    added = run(effect, size=size, rate=rate, drivers=drivers, true=true, signal=signal)
+    added = added - signal if effect.stage not in ("motion", "rate") else added
+    windows = windows_of(
+        size, rate, length / rate, axes=("x", "y", "z"), drivers=reduce(drivers), own=reduce(own)
+    )
+    means, design = added.reshape(3, -1, length).mean(axis=2), effect.explain(windows).mean
+    predicted = sum(
+        np.broadcast_to(values, means.shape) * np.reshape(getattr(effect, name), (-1, 1))
+        for name, values in design.items()
+    )
+    return means, predicted, design
 
 
 def band_powers(rates: Any, rate: float, edges: Any) -> NDArray[np.float64]:

@@ -32,18 +32,15 @@ def model(**change: Any) -> dict[str, Any]:
     return {"log": LOG, "noise": NOISE, "environment": WORLD, "effect": BIASED} | change
 
 
+#: Values of channels by their units.
+TYPICAL = {
+    "degree_Celsius": 60.0, "g": 1.0, "degree s-1": 90.0, "V": 24.0, "W": 1e-4, "uT": 30.0,
+    "Pa": 1e7, "1": 0.5,
+}  # fmt: skip
+
+
 def every_channel(duration: float) -> xr.Dataset:
     """Each channel that some effect asks for by its own name, so that none lacks its driver."""
-    typical = {
-        "degree_Celsius": 60.0,
-        "g": 1.0,
-        "degree s-1": 90.0,
-        "V": 24.0,
-        "W": 1e-4,
-        "uT": 30.0,
-        "Pa": 1e7,
-        "1": 0.5,
-    }
     units = {name: unit for kind in effects().values() for name, unit in kind.channels.items()}
     units |= {"accel_x": "g"}
     return combine(
@@ -51,7 +48,7 @@ def every_channel(duration: float) -> xr.Dataset:
             env.ramps(
                 name,
                 unit,
-                [[0, typical.get(unit, 1.0)], [duration, 1.3 * typical.get(unit, 1.0)]],
+                [[0, TYPICAL[unit]], [duration, 1.3 * TYPICAL[unit]]],
                 duration=duration,
                 start=LOG["start"],
             )
