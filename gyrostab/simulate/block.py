@@ -118,6 +118,12 @@ def next_block(
         values, state.effects[number] = step.effect.generate(chunk, state.effects[number])
         return step, values
 
+    def change(stage: str, signal: Array, **options: Any) -> None:
+        for number in by_stage[stage]:
+            rows = list(plan.steps[number].rows)
+            _, values = act(number, signal=signal[rows], **options)
+            signal[rows] = signal[rows] + values if stage == "rate" else values
+
     for number in by_stage["motion"]:
         step, values = act(number, true=true)
         for row, part in zip(
@@ -125,24 +131,15 @@ def next_block(
         ):
             true[plan.axes[row]] = true[plan.axes[row]] + part
     signal = _add_noise(plan, state, by_stage["noise"], act, units, true)
-    for number in by_stage["rate"]:
-        step, values = act(number, true=true, signal=signal[list(plan.steps[number].rows)])
-        signal[list(step.rows)] += values
-    for stage in ("sensor", "electronics"):
-        for number in by_stage[stage]:
-            step, values = act(number, true=true, signal=signal[list(plan.steps[number].rows)])
-            signal[list(step.rows)] = values
+    for stage in ("rate", "sensor", "electronics"):
+        change(stage, signal, true=true)
     slow = _sample_log(plan, by_stage["sampling"], act, signal, true, count)
     true = (
         {axis: values.reshape(count, factor).mean(axis=1) for axis, values in true.items()}
         if factor > 1
         else true
     )
-    for number in by_stage["logger"]:
-        step, values = act(
-            number, fast=False, true=true, signal=slow[list(plan.steps[number].rows)]
-        )
-        slow[list(step.rows)] = values
+    change("logger", slow, true=true, fast=False)
     _drop_gaps(plan, slow, first)
     return slow, state
 
