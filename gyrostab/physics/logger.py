@@ -226,11 +226,11 @@ class HeldSamples(Effect):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         rng, loss, memory = state
-        kept = self._samples_kept(chunk.rate)
+        n_kept = self._samples_kept(chunk.rate)
         if memory is None:
-            memory = np.repeat(chunk.signal[:, :1], kept, axis=1)
+            memory = np.repeat(chunk.signal[:, :1], n_kept, axis=1)
         history = np.concatenate([memory, chunk.signal], axis=1)
-        end, offset = chunk.first + chunk.size, kept - chunk.first
+        end, offset = chunk.first + chunk.size, n_kept - chunk.first
         while loss is not None and loss[0] < end:
             low, high = max(loss[0], chunk.first) + offset, min(loss[1], end) + offset
             if self.fill == "frame":
@@ -241,7 +241,7 @@ class HeldSamples(Effect):
             if loss[1] > end:
                 break
             loss = self._draw_loss(rng, loss[1], chunk.rate)
-        return history[:, kept:], (rng, loss, history[:, -kept:].copy())
+        return history[:, n_kept:], (rng, loss, history[:, -n_kept:].copy())
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict a larger N, or window means biased towards zero."""
