@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -116,14 +114,21 @@ def test_means_in_stick_slip_follow_the_measured_means_of_the_turns(table):
     time = np.arange(20_000) / 50.0
     rotation = 90.0 + 80.0 * np.sin(1.4 * np.pi * time)  # uneven within each window of 8 s
     effect = make_effect(table)
-    rates = run(effect, size=time.size, rate=50.0, drivers={"rotation_rate": rotation})
-    windows, means = windows_of(rates, 50.0, 400, {"rotation_rate": rotation})
+    means, even, _ = means_and_prediction(
+        effect, rate=50.0, length=400, drivers={"rotation_rate": rotation}
+    )
     inside = rotation / (360.0 * 50.0)
     turns = np.cumsum(inside) - inside / 2.0
     harmonics = np.exp(2j * np.pi * turns[:, None] * [1, 2, 3]).reshape(-1, 400, 3).mean(axis=1)
-    known = replace(windows, turn_means=dict.fromkeys(windows.axes, harmonics))
+    windows = windows_of(
+        time.size,
+        50.0,
+        8.0,
+        axes=("x", "y", "z"),
+        drivers={"rotation_rate": rotation.reshape(-1, 400).mean(axis=1)},
+        turn_means=dict.fromkeys("xyz", harmonics),
+    )
     (size,) = effect.size_parameters
     scale = np.atleast_1d(getattr(effect, size))[0]
-    np.testing.assert_allclose(scale * effect.explain(known).mean[size], means, atol=5e-3)
-    uneven = scale * effect.explain(windows).mean[size] - means
-    assert np.abs(uneven).max() > 0.1
+    np.testing.assert_allclose(scale * effect.explain(windows).mean[size], means, atol=5e-3)
+    assert np.abs(even - means).max() > 0.1
