@@ -30,14 +30,13 @@ from gyrostab.ingest.grid.rate import (
 )
 from gyrostab.ingest.grid.repeats import find_repeats, with_repeats
 from gyrostab.ingest.grid.scan_pass import ScanPass, file_of, stamp_blocks
-from gyrostab.ingest.grid.starting_period import Stamps
+from gyrostab.ingest.grid.starting_period import SECOND, Stamps
 from gyrostab.schema import signal_name
-from gyrostab.store.lazy import find_source, read_slice
+from gyrostab.store.lazy import find_source
 from gyrostab.time.grid import period_ns
 from gyrostab.time.stamps import stamp_ns
 
 _MAX_RATE_DIFFERENCE = 0.02  # relative, between declared and estimated rate
-_EVEN_ROWS = 2**18  # rows at the beginning that give the rate of a log with even stamps
 # Largest jitter at which stamps give the samples of 99 % of the rows; placing by stamp is then
 # tried first [samples].
 _SHARP_SIGMA = 0.2
@@ -65,34 +64,21 @@ class RowPlacer:
         return file_of(self.raw)[0]
 
     def _place_even(self) -> tuple[Placement, float, list[str]] | None:
-        """Place the rows of a long log with evenly spaced stamps, from its beginning alone.
+        """Place rows with evenly spaced stamps of a plain rate, without reading the stamps.
 
-        Returns None if the stamps are not even, a row has no sample, or the beginning has notes.
+        Returns None if the stamps are not even, a row has no sample, or another rate is given.
         """
-        raw, scanned = self.raw, self.scanned
-        clock = find_source(raw["time"].data) if "time" in raw.variables else None
+        scanned = self.scanned
+        clock = find_source(self.raw["time"].data) if "time" in self.raw.variables else None
         line = None if clock is None else find_line(clock.parts)
-        if line is None or scanned.absent or scanned.repeated or scanned.rows <= _EVEN_ROWS:
+        if line is None or line[1] <= 0 or scanned.absent or scanned.repeated:
             return None
         start, step = line
-        stamps = (start + step * np.arange(_EVEN_ROWS)).view("datetime64[ns]")
-        signal = signal_name(raw)
-        head = xr.Dataset(
-            {signal: (("axis", "row"), read_slice(raw[signal].data, 0, _EVEN_ROWS))},
-            {"time": ("row", stamps), "axis": raw["axis"].values},
-            raw.attrs,
-        )
-        bits = scanned.present[: _EVEN_ROWS // 8].copy()
-        placer = replace(self, raw=head, scanned=replace(scanned, rows=_EVEN_ROWS, present=bits))
-        placement, rate, notes = placer._place_all()
-        is_even = (
-            period_ns(rate) == (step, 0.0)
-            and placement.runs.tolist() == [[0, 0, _EVEN_ROWS]]
-            and not len(placement.events)
-        )
-        if notes or not is_even:
+        rate = float(f"{SECOND / step:.13g}")
+        if period_ns(rate) != (step, 0.0) or self.declared not in (None, rate):
             return None
-        return replace(placement, runs=np.array([[0, 0, scanned.rows]], dtype=np.int64)), rate, []
+        runs = [np.array([[0, 0, scanned.rows]], dtype=np.int64)]
+        return make_placement(start, runs, []), rate, []
 
     def _place_all(self) -> tuple[Placement, float, list[str]]:
         raw, scanned, declared = self.raw, self.scanned, self.declared
