@@ -114,7 +114,7 @@ def _read_frame(
 ) -> xr.Dataset:
     """Read a pandas table into a raw log, by the rules for files."""
     from gyrostab.ingest.columns.headers import FileColumn, split_header
-    from gyrostab.ingest.columns.plan_columns import plan_columns
+    from gyrostab.ingest.columns.plan_roles import plan_columns
     from gyrostab.ingest.columns.typed import read_columns
     from gyrostab.ingest.options import ReadOptions
     from gyrostab.ingest.reading import check_options

@@ -15,7 +15,7 @@ from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.dates import find_order, holds_date
 from gyrostab.ingest.columns.headers import FileColumn, split_header
 from gyrostab.ingest.columns.plan import Plan
-from gyrostab.ingest.columns.plan_columns import plan_columns
+from gyrostab.ingest.columns.plan_roles import plan_columns
 from gyrostab.ingest.columns.typed import (
     batch_rows,
     float32_note,

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.columns.headers import FileColumn
 from gyrostab.ingest.columns.plan import MAX_HEADERS, Column, Plan
-from gyrostab.ingest.columns.plan_columns import plan_columns
+from gyrostab.ingest.columns.plan_roles import plan_columns
 from gyrostab.ingest.columns.stamps import NAT, parse_time_unit
 from gyrostab.ingest.columns.typed import float32_note, read_columns, summarise_columns
 from gyrostab.ingest.combine import concatenate, with_channels

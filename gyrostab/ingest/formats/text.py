@@ -30,7 +30,7 @@ from gyrostab.ingest.columns.dates import (
 )
 from gyrostab.ingest.columns.headers import FileColumn
 from gyrostab.ingest.columns.plan import Column, Plan
-from gyrostab.ingest.columns.plan_columns import plan_columns
+from gyrostab.ingest.columns.plan_roles import plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, from_fortran
 from gyrostab.ingest.options import FileSummary, ReadOptions
