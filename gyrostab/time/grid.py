@@ -160,10 +160,6 @@ class _GridTransform(CoordinateTransform):
     def equals(self, other: CoordinateTransform, *, exclude: frozenset[Any] | None = None) -> bool:
         return isinstance(other, _GridTransform) and self._key() == other._key()
 
-    def shares_grid(self, other: _GridTransform) -> bool:
-        """Whether both are parts of a grid, apart from the sample at which they begin."""
-        return (self.start, self.rate, self.stride) == (other.start, other.rate, other.stride)
-
     def _key(self) -> tuple[Any, ...]:
         return (self.start, self.rate, self.first, self.stride, self.size)
 
@@ -250,7 +246,8 @@ class TimeGridIndex(CoordinateTransformIndex):
         """Return the common or united axis; it is computed if both are parts of one grid."""
         own, another = self.transform, other.transform
         shift, rest = divmod(another.first - own.first, own.stride)
-        if not rest and own.shares_grid(another):
+        grids = [(grid.start, grid.rate, grid.stride) for grid in (own, another)]
+        if not rest and grids[0] == grids[1]:
             begins, ends = (0, shift), (own.size, shift + another.size)
             if how == "inner":
                 return type(self)(own.select(range(max(begins), min(ends))))

@@ -225,7 +225,10 @@ def _common_attributes(
     common = {
         key: value
         for key, value in first.items()
-        if all(_is_equal(source.log.attrs.get(key), value) for source in sources)
+        if all(
+            type(other := source.log.attrs.get(key)) is type(value) and np.all(other == value)
+            for source in sources
+        )
     }
     files, notes_of_logs = (
         [texts(source.log, name) for source in sources] for name in ("source_files", "notes")
@@ -276,7 +279,3 @@ def merge_notes(notes_by_file: Iterable[tuple[str, Sequence[str]]]) -> list[str]
         for note in notes:
             pooled.setdefault(note.removeprefix(f"{name}: "), []).append(name)
     return [f"{list_some(names)}: {note}" for note, names in pooled.items()]
-
-
-def _is_equal(value: Any, other: Any) -> bool:
-    return type(value) is type(other) and bool(np.all(value == other))
