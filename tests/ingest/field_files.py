@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -48,15 +48,20 @@ def write_trace(
         file.write(record)
 
 
+def las_text(curves: str, rows: Iterable[str]) -> str:
+    """Return a LAS file with curves, such as ``TIME.S GYRO_X.deg/h``, and rows."""
+    head = "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nSTRT. 0 :\nSTOP. 1 :\nSTEP. 0 :\nNULL. -999.25 :\n~C"
+    return "\n".join([head, *(f"{curve} :" for curve in curves.split()), "~A", *rows, ""])
+
+
 def write_las(place: Path) -> Made:
-    head = "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nSTRT. 0 :\nSTOP. 1 :\nSTEP. 0 :\nNULL. -999.25 :\n"
-    curves = "~C\nDTIM. : index\n" + "".join(f"GYRO_{axis}.deg/h :\n" for axis in "XYZ")
     rows = (
-        f"{np.datetime_as_string(stamp, 'ms').replace('T', '/')} {x} {y} {z} {t}\n"
+        f"{np.datetime_as_string(stamp, 'ms').replace('T', '/')} {x} {y} {z} {t}"
         for stamp, (x, y, z), t in zip(STAMPS, RATES.T * 3.6, TEMPERATURE, strict=True)
     )
+    curves = "DTIM. GYRO_X.deg/h GYRO_Y.deg/h GYRO_Z.deg/h TEMPERATURE.degC"
     path = place / "run.las"
-    path.write_text(f"{head}{curves}TEMPERATURE.degC :\n~A\n{''.join(rows)}")
+    path.write_text(las_text(curves, rows))
     return Made(path, "las", {})
 
 

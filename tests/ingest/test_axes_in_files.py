@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import netCDF4
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -18,6 +17,7 @@ from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.store.lazy import find_source
 from tests.ingest.field_files import write_trace
+from tests.support.columns import write_columns
 
 N, PERIOD_NS = 2000, 10_000_000
 START = np.datetime64("2026-03-01T06:00:00", "ns").astype(np.int64)
@@ -47,13 +47,8 @@ def write(
     if path.suffix == ".parquet":
         parquet.write_table(pa.table(columns), path)
     elif path.suffix == ".nc":
-        with netCDF4.Dataset(path, "w") as file:
-            file.createDimension("row", positions.size)
-            for header, values in columns.items():
-                name, unit = header.rstrip("]").split(" [")
-                variable = file.createVariable(name, values.dtype, ("row",))
-                variable.units = unit
-                variable[:] = values
+        split = {header: header.rstrip("]").split(" [") for header in columns}
+        write_columns(path, {split[h][0]: (columns[h], split[h][1]) for h in columns})
     else:
         rows = "\n".join(
             ",".join(repr(value) for value in row)

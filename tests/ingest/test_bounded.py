@@ -26,6 +26,7 @@ from gyrostab.ingest.files import Reader
 from gyrostab.ingest.formats import matlab
 from gyrostab.ingest.formats import netcdf as netcdf_reader
 from gyrostab.ingest.limits import check_limits
+from tests.support.columns import write_columns
 from tests.support.published import published_davar
 
 place_rows_module = sys.modules["gyrostab.ingest.grid.place_rows"]
@@ -33,15 +34,8 @@ place_rows_module = sys.modules["gyrostab.ingest.grid.place_rows"]
 
 def write_stamped_netcdf(path: Path, rows: int) -> Path:
     """Write a CF file with an int64 stamp for each sample at 400 Hz."""
-    with netCDF4.Dataset(path, "w") as file:
-        file.createDimension("time", rows)
-        time = file.createVariable("time", "i8", ("time",))
-        time.units = "nanoseconds since 1970-01-01"
-        gyro = file.createVariable("gyro_x", "f8", ("time",))
-        gyro.units = "deg/h"
-        time[:] = np.arange(rows) * 2_500_000
-        gyro[:] = np.arange(rows) % 7 + 0.5
-    return path
+    stamps, gyro = np.arange(rows) * 2_500_000, np.arange(rows) % 7 + 0.5
+    return write_columns(path, {"time": (stamps, SINCE), "gyro_x": (gyro, "deg/h")})
 
 
 def peak_of(work: Callable[[], object]) -> int:
@@ -402,22 +396,12 @@ def test_line_of_a_wide_table_is_longer_than_the_usual_head(tmp_path: Path) -> N
 
 def write_gappy_netcdf(path: Path, rows: int, stamps: np.ndarray) -> Path:
     """Write a CF file with lost rows, missing cells, and a channel filled in every tenth row."""
-    draw = np.random.default_rng(6)
-    with netCDF4.Dataset(path, "w") as file:
-        file.createDimension("time", rows)
-        for name in ("time", "gyro_x", "gyro_y", "temperature"):
-            variable = file.createVariable(name, "i8" if name == "time" else "f8", ("time",))
-            values = stamps if name == "time" else draw.normal(size=rows)
-            if name.startswith("gyro"):
-                values[3000:3100] = np.nan
-            if name == "gyro_y":
-                values[1000:1016] = np.nan
-                values[rows - 5] = np.inf
-            if name == "temperature":
-                values[np.arange(rows) % 10 > 0] = np.nan
-            variable.units = {"time": SINCE, "temperature": "degC"}.get(name, "deg/h")
-            variable[:] = values
-    return path
+    x, y, temperature = np.random.default_rng(6).normal(size=(3, rows))
+    x[3000:3100] = y[3000:3100] = y[1000:1016] = np.nan
+    y[rows - 5] = np.inf
+    temperature[np.arange(rows) % 10 > 0] = np.nan
+    columns = {"time": (stamps, SINCE), "gyro_x": (x, "deg/h"), "gyro_y": (y, "deg/h")}
+    return write_columns(path, {**columns, "temperature": (temperature, "degC")})
 
 
 @pytest.mark.parametrize("even", [True, False])

@@ -16,7 +16,6 @@ from typing import Any
 import cf_units
 import cftime
 import h5py
-import netCDF4
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -30,6 +29,7 @@ import gyrostab
 from gyrostab.errors import GyrostabError
 from gyrostab.ingest import read_log
 from gyrostab.ingest.grid.regularise import regularise
+from tests.support.columns import write_columns
 
 #: Without the search for an explanation, which takes minutes after a failure.
 PHASES = (Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink)
@@ -342,38 +342,24 @@ def tolerance(clock: Clock) -> int:
     return 2000 if clock.unit == "hours" or clock.dtype == "f8" or clock.packed else 1
 
 
+def named_columns(
+    law: Law, packed: Packed, time: tuple[Any, dict[str, Any]]
+) -> dict[str, tuple[Any, dict[str, Any]]]:
+    """Return the columns with their attributes."""
+    stored, void = packed.store()
+    axes = zip("xy", stored, strict=True)
+    return {"time": time, **{f"gyro_{a}": (row, packed.attributes(law, void)) for a, row in axes}}
+
+
 def write_netcdf(
     path: Path, law: Law, packed: Packed, clock: Clock, *, form: str, chunk: int, level: int
 ) -> None:
     stamps, time_attributes = clock.store()
-    stored, void = packed.store()
     if form.startswith("NETCDF3") and stamps.dtype.kind == "i":
         stamps = stamps.astype("f8") if abs(stamps).max() >= 2**31 else stamps.astype("i4")
-    with netCDF4.Dataset(path, "w", format=form) as file:
-        file.createDimension("obs", KEPT.size)
-        for name, values, attributes in (
-            ("time", stamps, time_attributes),
-            *(
-                (f"gyro_{axis}", row, packed.attributes(law, void))
-                for axis, row in zip("xy", stored, strict=True)
-            ),
-        ):
-            extra: dict[str, Any] = {}
-            big = values.dtype.str[0] == ">"
-            if form == "NETCDF4":
-                extra = {
-                    "chunksizes": (chunk,),
-                    "zlib": level > 0,
-                    "complevel": max(level, 1),
-                    "endian": "big" if big else "little",
-                }
-            kind = values.dtype if form == "NETCDF4" else values.dtype.newbyteorder("=")
-            variable = file.createVariable(
-                name, kind, ("obs",), fill_value=attributes.pop("_FillValue", None), **extra
-            )
-            variable.set_auto_maskandscale(False)
-            variable.setncatts(attributes)
-            variable[:] = values.astype(kind)
+    extra = {"chunksizes": (chunk,), "zlib": level > 0, "complevel": max(level, 1)}
+    columns = named_columns(law, packed, (stamps, time_attributes))
+    write_columns(path, columns, form, **(extra if form == "NETCDF4" else {}))
 
 
 @pytest.mark.parametrize("form", ["NETCDF4", "NETCDF3_CLASSIC", "NETCDF3_64BIT_DATA"])
@@ -405,21 +391,11 @@ def test_netcdf(form, law, packed, clock, chunk, level):
 )
 @settings(max_examples=15, phases=PHASES)
 def test_hdf5(law, packed, clock, chunk, level):
-    stamps, time_attributes = clock.store()
-    stored, void = packed.store()
+    columns = named_columns(law, packed, clock.store())
     with TemporaryDirectory() as folder:
         path = Path(folder) / "log.h5"
-        with h5py.File(path, "w") as file:
-            for name, values, attributes in (
-                ("imu/time", stamps, time_attributes),
-                *(
-                    (f"imu/gyro_{axis}", row, packed.attributes(law, void))
-                    for axis, row in zip("xy", stored, strict=True)
-                ),
-            ):
-                file.create_dataset(
-                    name, data=values, chunks=(chunk,), compression=level
-                ).attrs.update(attributes)
+        groups = {f"imu/{name}": column for name, column in columns.items()}
+        write_columns(path, groups, chunks=(chunk,), compression=level)
         names = {f"imu.{name}": name for name in ("time", "gyro_x", "gyro_y")}
         if clock.is_refused:
             with pytest.raises(GyrostabError, match=r"log\.h5: .*time"):

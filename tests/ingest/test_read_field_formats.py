@@ -26,6 +26,7 @@ from tests.ingest.field_files import (
     Made,
     import_matio,
     kvh_message,
+    las_text,
     stim_message,
     write_wits0,
     write_witsml,
@@ -73,15 +74,22 @@ def test_a_file_that_is_cut_off_is_read_in_part_or_named(made: Made, tmp_path: P
         ("mcap", "rosbags.highlevel", "rosbag"),
         ("novatel", "novatel_edie.oem", "novatel"),
         ("timetable5", "matio", "matlab"),
+        ("a.mseed", "pymseed", "miniseed"),
+        ("a.ulg", "pyulog", "ulog"),
+        ("a.tdms", "nptdms", "tdms"),
+        ("a.las", "lasio", "las"),
     ],
 )
 def test_a_missing_library_is_named_with_its_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, module: str, extra: str
 ) -> None:
-    made = WRITERS[name](tmp_path)
+    path, _, options = WRITERS[name](tmp_path) if name in WRITERS else (tmp_path / name, "", {})
+    if name not in WRITERS:
+        path.write_bytes(b"~A\n")
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(OptionError, match=rf"{made.path.name}: .*{module}.*gyrostab\[{extra}\]"):
-        read_log(made.path, **made.options)
+    advice = rf"install it with pip install 'gyrostab\[{extra}\]'"
+    with pytest.raises(OptionError, match=f"{path.name}: reading it needs {module}; {advice}"):
+        read_log(path, **options)
 
 
 def test_the_file_of_a_ros_bag_is_read_without_its_folder(tmp_path: Path) -> None:
@@ -102,8 +110,7 @@ def test_the_index_of_las_holds_dates_and_times(
     tmp_path: Path, cell: str, unit: str, first: str
 ) -> None:
     path = tmp_path / "a.las"
-    head = "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nSTRT. 0 :\nSTOP. 9 :\nSTEP. 0 :\nNULL. -999.25 :\n"
-    path.write_text(f"{head}~C\nINDEX.{unit} : index\nGYRO_X.deg/h :\n~A\n{cell} 1.5\n{cell} 2\n")
+    path.write_text(las_text(f"INDEX.{unit} GYRO_X.deg/h", [f"{cell} 1.5", f"{cell} 2"]))
     raw = read_log(path)
     assert raw.time.values.tolist() == [np.datetime64(first, "ns").astype(np.int64)] * 2
     assert raw.rate[0].values.tolist() == [1.5, 2.0]
@@ -188,24 +195,6 @@ def test_numbers_of_24_bits(tmp_path: Path, order: Any) -> None:
     fields = '[{skip = 1}, {name = "gyro_x [deg/h]", type = "int24"}]'
     path.with_suffix(".toml").write_text(f'byte_order = "{order}"\nfields = {fields}')
     assert read_log(path, rate=1.0).rate[0].values.tolist() == values
-
-
-@pytest.mark.parametrize(
-    "layout",
-    [
-        'sync = "GG"\nfields = [{name = "gyro_x", type = "int8"}]',
-        'fields = [{name = "gyro_x", type = "int8"}, {counter = 128, type = "float32"}]',
-        'fields = [{name = "gyro_x", type = "int8"}, {counter = 1, type = "uint8"}]',
-        'fields = [{name = "gyro_x", type = "int8"}, {counter = 1000, type = "uint8"}]',
-        'fields = [{name = "gyro_x", type = ["int8"]}]',
-        "fields = 3",
-    ],
-)
-def test_unusable_layouts_are_named(tmp_path: Path, layout: str) -> None:
-    (tmp_path / "run.bin").write_bytes(bytes(100))
-    (tmp_path / "run.toml").write_text(layout)
-    with pytest.raises(OptionError, match=r"^run\.toml: "):
-        read_log(tmp_path / "run.bin", rate=1.0)
 
 
 def test_items_of_wits_are_channels(tmp_path: Path) -> None:

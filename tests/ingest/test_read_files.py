@@ -6,7 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
@@ -18,6 +17,7 @@ from gyrostab.ingest import FileSummary, ReadOptions, read_log, readers, scan_fi
 from gyrostab.schema import check_log, check_raw
 from gyrostab.store.read import MIN_LAZY_VALUES
 from gyrostab.time.grid import TimeGridIndex, time_coordinate
+from tests.support.columns import write_columns
 
 HEADER = "time [s],gyro_x [deg/h],gyro_y [deg/h],temperature [degC]\n"
 
@@ -270,14 +270,9 @@ def test_unusable_channel_files_are_explained(tmp_path: Path) -> None:
 
 def test_channels_from_netcdf(tmp_path: Path) -> None:
     log = write(tmp_path / "log.csv", "time [s],gyro_x [deg/h]\n0,1\n1,2\n")
-    with netCDF4.Dataset(tmp_path / "slow.nc", "w") as file:
-        file.createDimension("time", 3)
-        time = file.createVariable("time", "i4", ("time",))
-        time.units = "seconds since 1970-01-01"
-        time[:] = [0, 5, 9]
-        pressure = file.createVariable("pressure", "f4", ("time",))
-        pressure.units = "kPa"
-        pressure[:] = [1, 2, 3]
+    stamps = np.array([0, 5, 9], "i4"), "seconds since 1970-01-01"
+    pressure = np.array([1, 2, 3], "f4"), "kPa"
+    write_columns(tmp_path / "slow.nc", {"time": stamps, "pressure": pressure})
     np.testing.assert_array_equal(
         read_log(log, channel=tmp_path / "slow.nc").pressure, [1000, 2000, 3000]
     )

@@ -19,12 +19,7 @@ from gyrostab.ingest.files import scan_file
 from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.io.datasets import to_netcdf
 from gyrostab.io.opening import open_log
-
-
-def write(folder: Path, text: str, name: str = "log.csv") -> Path:
-    path = folder / name
-    path.write_text(text)
-    return path
+from tests.support.text_logs import write
 
 
 def seconds(raw: xr.Dataset) -> list[float]:

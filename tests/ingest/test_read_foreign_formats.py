@@ -12,7 +12,7 @@ from scipy.io import savemat
 
 from gyrostab.errors import FormatError, MissingUnitError
 from gyrostab.ingest import read_log, scan_file
-from tests.ingest.field_files import write_trace
+from tests.ingest.field_files import las_text, write_trace
 
 RATE = 50.0
 ROWS = 3000
@@ -66,12 +66,8 @@ def test_truncated_miniseed_keeps_its_complete_records(tmp_path: Path, cut: int)
 
 
 def write_las(path: Path, date: str, clock: str, rows: list[str]) -> Path:
-    head = "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nSTRT.S 0 :\nSTOP.S 9 :\nSTEP.S 0 :\nNULL. -999.25 :\n"
-    curves = (
-        f"~C\nDATE.{date} : date\nTIME.{clock} : time\nGYRO_X.deg/h : "
-        "rate\nTEMPERATURE.degC : in the tool\n~A\n"
-    )
-    path.write_text(head + curves + "".join(f"{row} 1.5 60\n" for row in rows))
+    curves = f"DATE.{date} TIME.{clock} GYRO_X.deg/h TEMPERATURE.degC"
+    path.write_text(las_text(curves, [f"{row} 1.5 60" for row in rows]))
     return path
 
 

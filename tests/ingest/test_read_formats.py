@@ -22,6 +22,7 @@ from gyrostab.ingest import ReadOptions, read_log, readers, scan_file
 from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.columns.pieces import Buffers, Spool
 from gyrostab.schema import check_raw
+from tests.support.columns import write_columns
 
 ROWS = 500
 START_US = 1_767_225_600_000_000  # 2026-01-01
@@ -72,12 +73,7 @@ def _bare() -> dict[str, tuple[str, np.ndarray]]:
 
 
 def as_netcdf(path: Path) -> dict[str, Any]:
-    with netCDF4.Dataset(path, "w") as file:
-        file.createDimension("obs", ROWS)
-        for name, (unit, values) in _bare().items():
-            variable = file.createVariable(name, values.dtype, ("obs",))
-            variable.units = unit
-            variable[:] = values
+    write_columns(path, {name: (values, unit) for name, (unit, values) in _bare().items()})
     return {}
 
 
@@ -280,11 +276,7 @@ def test_float32_stamps_are_noted(tmp_path: Path) -> None:
 
 def test_unit_option_overrules_netcdf_units(tmp_path: Path) -> None:
     path = tmp_path / "counts.nc"
-    with netCDF4.Dataset(path, "w") as file:
-        file.createDimension("time", 4)
-        variable = file.createVariable("BJZ", "i4", ("time",))
-        variable.units = "counts"
-        variable[:] = [1, 2, 3, 4]
+    write_columns(path, {"BJZ": (np.arange(1, 5, dtype="i4"), "counts")})
     with pytest.raises(
         Exception, match=r"'counts', which is a unit of number, not of rate.*--unit"
     ):
@@ -307,13 +299,9 @@ def test_labels_of_axes_in_netcdf_are_characters(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["gyro_x", "omega"])
 def test_gyro_axes_of_netcdf_are_on_a_shorter_dimension(tmp_path: Path, name: str) -> None:
-    with netCDF4.Dataset(tmp_path / "log.nc", "w") as file:
-        for dim, size, column, unit in (("a", 200, "accel_x", "m/s^2"), ("g", 50, name, "deg/h")):
-            file.createDimension(dim, size)
-            clock = file.createVariable("time" if dim == "g" else dim, "f8", (dim,))
-            clock.units, clock[:] = "seconds since 2026-01-01", np.arange(size) / size
-            values = file.createVariable(column, "f8", (dim,))
-            values.units, values[:] = unit, np.zeros(size)
+    slow, fast = ((np.arange(n) / n, "seconds since 2026-01-01") for n in (50, 200))
+    axis, other = {name: (np.zeros(50), "deg/h")}, {"accel_x": (np.zeros(200), "m/s^2")}
+    write_columns(tmp_path / "log.nc", {"a": fast, **other, "time": slow, **axis})
     options = {"map": {"OMEGA": "gyro_x"}} if name == "omega" else {}
     raw = read_log(tmp_path / "log.nc", **options)
     assert (raw.sizes["row"], raw.sizes["time_accel_x"]) == (50, 200)
@@ -322,16 +310,10 @@ def test_gyro_axes_of_netcdf_are_on_a_shorter_dimension(tmp_path: Path, name: st
 
 def test_masked_netcdf_cells_are_missing(tmp_path: Path) -> None:
     path = tmp_path / "packed.nc"
-    with netCDF4.Dataset(path, "w") as file:
-        file.createDimension("n", 4)
-        time = file.createVariable("time", "i8", ("n",), fill_value=-1)
-        time.units = "milliseconds since 2026-01-01"
-        time[:] = [0, 10, -1, 30]
-        gyro = file.createVariable("gyro_x", "i2", ("n",), fill_value=-9999)
-        gyro.setncatts({"units": "degree hour-1", "scale_factor": 0.25})
-        gyro.set_auto_maskandscale(False)
-        gyro[:] = [4, -9999, 8, 12]
-    raw = read_log(path)
+    since = {"units": "milliseconds since 2026-01-01", "_FillValue": -1}
+    packing = {"units": "degree hour-1", "scale_factor": 0.25, "_FillValue": -9999}
+    gyro = np.array([4, -9999, 8, 12], "i2"), packing
+    raw = read_log(write_columns(path, {"time": ([0, 10, -1, 30], since), "gyro_x": gyro}))
     np.testing.assert_array_equal(raw.rate[0], [1.0, np.nan, 2.0, 3.0])
     assert np.isnat(raw.time.values).tolist() == [False, False, True, False]
     assert raw.time.values[3] == np.datetime64("2026-01-01T00:00:00.030")
@@ -383,27 +365,18 @@ def test_damage_within_the_data_is_an_input_error(tmp_path: Path, suffix: str) -
 
 def test_plain_hdf5_with_units_as_attributes(tmp_path: Path) -> None:
     path = tmp_path / "log.h5"
-    with h5py.File(path, "w") as file:
-        for name, data, units in (
-            ("time", [0.0, 0.5, 1.0], "s"),
-            ("gyro_x", [1.0, 2.0, 3.0], "deg/s"),
-        ):
-            file[name] = np.array(data)
-            file[name].attrs["units"] = units
-    raw = read_log(path)
+    columns = {"time": ([0.0, 0.5, 1.0], "s"), "gyro_x": ([1.0, 2.0, 3.0], "deg/s")}
+    raw = read_log(write_columns(path, columns))
     np.testing.assert_array_equal(raw.rate[0], [3600.0, 7200.0, 10800.0])
     assert raw.time.values[1] == np.datetime64(500, "ms")
     assert scan_file(path).format == "hdf5"
 
 
 def test_hdf5_with_a_filter_of_netcdf_is_read(tmp_path: Path) -> None:
-    with netCDF4.Dataset(tmp_path / "log.nc", "w") as file:
-        file.createDimension("time", 500)
-        for name, unit in (("time", "s"), ("gyro_x", "deg/h")):
-            variable = file.createVariable(name, "f8", ("time",), compression="zstd")
-            variable.units = unit
-            variable[:] = np.arange(500) / 100
-    raw = read_log((tmp_path / "log.nc").rename(tmp_path / "log.h5"))
+    values = np.arange(500) / 100
+    columns = {"time": (values, "s"), "gyro_x": (values, "deg/h")}
+    stored = write_columns(tmp_path / "log.nc", columns, compression="zstd")
+    raw = read_log(stored.rename(tmp_path / "log.h5"))
     assert raw.rate.values[0, -1] == 4.99
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import h5py
 import netCDF4
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ import zarr
 from gyrostab.errors import FormatError, UnitError
 from gyrostab.ingest import read_log
 from gyrostab.ingest.formats.packing import Packing
+from tests.support.columns import write_columns
 
 ROWS = 60
 
@@ -28,31 +28,9 @@ def write(
     form: str = "NETCDF4",
 ) -> Path:
     """Write one gyro axis of stored numbers, with the fill value among the attributes."""
-    time = {"units": "s", **(time or {})}
-    if path.suffix == ".h5":
-        with h5py.File(path, "w") as file:
-            for name, values, attrs in (
-                ("time", np.arange(ROWS, dtype="i4"), time),
-                ("gyro_x", stored, {"units": "deg/h", **attributes}),
-            ):
-                file[name] = values
-                file[name].attrs.update(attrs)
-        return path
-    with netCDF4.Dataset(path, "w", format=form) as file:
-        file.createDimension("obs", ROWS)
-        for name, values, attrs in (
-            ("time", np.arange(ROWS, dtype="i4"), time),
-            ("gyro_x", stored, {"units": "deg/h", **attributes}),
-        ):
-            endian = "big" if values.dtype.str[0] == ">" and form == "NETCDF4" else "native"
-            kind = values.dtype if endian == "big" else values.dtype.newbyteorder("=")
-            variable = file.createVariable(
-                name, kind, ("obs",), fill_value=attrs.pop("_FillValue", None), endian=endian
-            )
-            variable.set_auto_maskandscale(False)
-            variable.setncatts(attrs)
-            variable[:] = values
-    return path
+    stamps = np.arange(ROWS, dtype="i4"), {"units": "s", **(time or {})}
+    gyro = stored, {"units": "deg/h", **attributes}
+    return write_columns(path, {"time": stamps, "gyro_x": gyro}, form)
 
 
 COUNTS = np.arange(ROWS, dtype="i2") - 30

@@ -8,13 +8,10 @@ from typing import Any
 import cf_units
 import cftime
 import dask.array
-import h5py
-import netCDF4
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
-import xarray as xr
 from pyarrow import parquet
 
 from gyrostab.errors import FormatError, OptionError, UnitError
@@ -22,29 +19,16 @@ from gyrostab.ingest import read_log, scan_file
 from gyrostab.ingest.columns.stamps import NAT, integers_to_ns, parse_time_unit
 from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.time.stamps import stamp_ns
+from tests.ingest.field_files import las_text
+from tests.support.columns import write_columns
 
 ROWS = 40
 
 
 def write_stamped(path: Path, stamps: np.ndarray, **attributes: Any) -> Path:
     """Write NetCDF or HDF5 with one axis, and stamps with these attributes."""
-    if path.suffix == ".h5":
-        with h5py.File(path, "w") as file:
-            file["time"] = stamps
-            file["time"].attrs.update(attributes)
-            file["gyro_x"] = np.arange(ROWS)
-            file["gyro_x"].attrs["units"] = "deg/h"
-        return path
-    with netCDF4.Dataset(path, "w") as file:
-        file.createDimension("obs", ROWS)
-        for name, values, attrs in (
-            ("time", stamps, attributes),
-            ("gyro_x", np.arange(ROWS), {"units": "deg/h"}),
-        ):
-            variable = file.createVariable(name, values.dtype, ("obs",))
-            variable.setncatts(attrs)
-            variable[:] = values
-    return path
+    gyro = np.arange(ROWS), "deg/h"
+    return write_columns(path, {"time": (stamps, attributes), "gyro_x": gyro})
 
 
 def dates(year: int, unit: str = "us") -> np.ndarray:
@@ -251,15 +235,9 @@ def test_unused_epoch_is_noted(tmp_path):
 
 
 def test_dates_of_las_files_are_counted_or_read(tmp_path):
-    rows = "\n".join(
-        f"{1500 if row == 7 else 2026}-05-06 00:00:{row:02d} {row}" for row in range(ROWS)
-    )
-    head = (
-        "~V\nVERS. 2.0 :\nWRAP. NO :\n~W\nNULL. -999.25 :\n~C\nDATE. : date\nTIME. : "
-        "time\nGYRO_X.deg/h : rate\n~A\n"
-    )
+    rows = (f"{1500 if row == 7 else 2026}-05-06 00:00:{row:02d} {row}" for row in range(ROWS))
     path = tmp_path / "log.las"
-    path.write_text(head + rows + "\n")
+    path.write_text(las_text("DATE. TIME. GYRO_X.deg/h", rows))
     stamps = read_log(path).time.values
     assert np.flatnonzero(np.isnat(stamps)).tolist() == [7]
     assert stamps[8] == np.datetime64("2026-05-06T00:00:08")
@@ -309,17 +287,8 @@ def test_clock_is_continued_over_batches_and_on_disk(tmp_path, monkeypatch, name
     monkeypatch.setattr("gyrostab.ingest.columns.typed.BATCH_ROWS", batch)
     clock = 86400.0 - 100.0 + np.arange(10_000) / 20
     clock = np.round(clock + 0.002 * np.random.default_rng(1).standard_normal(clock.size), 4)
-    path = tmp_path / name
     columns = {"time": (clock % 86400, "s"), "gyro_x": (np.arange(10_000.0), "deg/h")}
-    if name == "log.h5":
-        with h5py.File(path, "w") as file:
-            for key, (values, units) in columns.items():
-                file[key] = values
-                file[key].attrs["units"] = units
-    else:
-        data = {key: ("obs", values, {"units": units}) for key, (values, units) in columns.items()}
-        xr.Dataset(data).to_netcdf(path, format="NETCDF3_64BIT")
-    raw = read_log(path)
+    raw = read_log(write_columns(tmp_path / name, columns, "NETCDF3_64BIT_OFFSET"))
     assert isinstance(raw.rate.data, dask.array.Array)
     read = raw.time.values.astype("datetime64[ns]").view(np.int64) / 1e9
     np.testing.assert_allclose(read, clock, atol=1e-6)

@@ -282,11 +282,6 @@ def test_rows_lost_among_shared_stamps_make_no_rows_of_the_tick():
     assert log.sizes["time"] == pytest.approx(2000, abs=3)
 
 
-def test_multiple_of_the_rate_is_not_accepted():
-    with pytest.raises(TimeError, match=r"200 Hz.*100 Hz"):
-        regularise(raw_log(stamps_of(np.arange(2000), 100.0)), rate=200.0)
-
-
 @pytest.mark.parametrize("rows", [1000, 5000])
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.3])
 @pytest.mark.parametrize("group", [4, 5])
