@@ -14,7 +14,6 @@ from gyrostab.ingest import read_log, reading
 from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.columns.pieces import EvenPiece, Spool, find_even, find_line
 from gyrostab.ingest.columns.raw_log import clean_column
-from gyrostab.kernels.grid.stamps import NO_STAMP, new_state, place
 from gyrostab.store.lazy import concatenate_columns, read_into, read_slice
 from gyrostab.store.threads import map_in_order
 
@@ -89,31 +88,6 @@ def test_log_in_pieces_equals_the_plain_log(tmp_path, monkeypatch, module, decim
     assert piecewise.rate.chunks is not None
     xr.testing.assert_identical(piecewise.compute(), plain)
     np.testing.assert_array_equal(bits(piecewise.rate.compute().values), bits(plain.rate.values))
-
-
-def test_even_stamps_are_placed_like_nearly_even_ones():
-    """With a nanosecond of jitter the kernel takes another path; the log exceeds its memory."""
-    rng = np.random.default_rng(5)
-    samples = np.sort(rng.choice(50_000, 49_900, replace=False))
-    rows = np.concatenate(
-        [samples[:30_000], samples[30_001:30_006], samples[30_000:30_001], samples[30_006:]]
-    )  # one row comes late
-    stamps = 7_000_000_000 + rows * 2_500_000
-    stamps[123] = NO_STAMP
-    placements = []
-    for jitter in (0, 1):
-        state, ring = new_state()
-        shaken = np.where(
-            stamps == NO_STAMP, stamps, stamps + jitter * (np.arange(stamps.size) % 3)
-        )
-        runs, events = place(
-            np.arange(stamps.size), shaken, stamps.size, 2_500_000.0, 0.75, 1e9, state, ring
-        )
-        placements.append((runs, events[:, :3], state[:3], np.array(ring)))
-    for first, second in zip(*placements, strict=True):
-        np.testing.assert_array_equal(first, second)
-    assert len(placements[0][1]) == 1  # the late row
-    assert len(placements[0][0]) > 90  # the gaps
 
 
 def test_results_come_in_the_order_of_the_items_and_few_are_fetched_ahead():

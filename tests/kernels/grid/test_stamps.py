@@ -56,6 +56,16 @@ def test_out_of_order_row_takes_its_free_sample():
     assert events[:, [0, 1, 2]].tolist() == [[OUT_OF_ORDER, 3, 4]]
 
 
+def test_late_row_is_placed_in_a_log_longer_than_the_memory_of_the_kernel():
+    samples = np.sort(np.random.default_rng(5).choice(50_000, 49_900, replace=False))
+    samples -= samples[0]
+    samples[30_000:30_006] = samples[[*range(30_001, 30_006), 30_000]]
+    assert samples[124] - samples[122] == 2
+    placed, events = place([None if row == 123 else s for row, s in enumerate(samples)])
+    assert placed == samples.tolist()
+    assert events[:, [0, 1, 2]].tolist() == [[OUT_OF_ORDER, samples[30_005], 30_005]]
+
+
 def test_out_of_order_row_without_a_free_sample_is_dropped():
     placed, events = place([0, 1, 2, 3, 1, 4, 5])
     assert placed == [0, 1, 2, 3, -1, 4, 5]
