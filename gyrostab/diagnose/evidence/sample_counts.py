@@ -174,11 +174,10 @@ def _log_ratio(count: Array, mean: Array) -> Array:
     )
 
 
-def _best_held_out(by_subset: list[Array]) -> Array:
-    """Return the largest over the lengths of the sum over folds."""
-    evidence = np.stack(by_subset)
-    without_fold = evidence[1:].reshape(-1, FOLDS, *evidence.shape[1:])
-    return np.asarray((evidence[0] - without_fold).sum(axis=1).max(axis=0))
+def _best_held_out(evidence: Array) -> Array:
+    """Return the largest over the lengths of the sum over folds, of evidence (..., subset)."""
+    gain = evidence[..., :1] - evidence[..., 1:]
+    return np.asarray(gain.reshape(*gain.shape[:-1], -1, FOLDS).sum(axis=-1).max(axis=-1))
 
 
 def sample_count_evidence(
@@ -188,11 +187,8 @@ def sample_count_evidence(
 
     Mean (axis, block) and spread (axis,) are from `expected_counts`, subsets from `fold_subsets`.
     """
-    log_ratios = []
-    for subset in subsets:
-        count = values[:, :, subset].sum(axis=2) / spread
-        log_ratios.append(_log_ratio(count, mean[:, subset].sum(axis=1) / spread))
-    return _best_held_out(log_ratios)
+    count, expected = ((part @ subsets.T) / spread[:, None] for part in (values, mean))
+    return _best_held_out(_log_ratio(count, expected))
 
 
 def kurtosis_evidence(
@@ -205,12 +201,8 @@ def kurtosis_evidence(
     z = np.clip(
         np.where(np.isfinite(values), (values - mean[:, None]) / spread[:, None], 0.0), -8.0, 8.0
     )
-    log_ratios = []
-    for subset in subsets:
-        total = z[:, :, subset].sum(axis=2) / np.sqrt(subset.sum())
-        size = 100.0  # prior variance of the total of the whole record
-        prior = size * subset.mean()
-        log_ratios.append(
-            0.5 * total**2 * prior / (1.0 + prior) * (total > 0) - 0.5 * np.log1p(prior)
-        )
-    return _best_held_out(log_ratios)
+    total = (z @ subsets.T) / np.sqrt(subsets.sum(axis=1))
+    size = 100.0  # prior variance of the total of the whole record
+    prior = size * subsets.mean(axis=1)
+    evidence = 0.5 * total**2 * prior / (1.0 + prior) * (total > 0) - 0.5 * np.log1p(prior)
+    return _best_held_out(evidence)
