@@ -18,6 +18,7 @@ from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     cumulative,
     exponential_score,
+    part_windows,
     statistic_dataset,
 )
 from gyrostab.diagnose.statistics.wording import axes_text
@@ -83,11 +84,11 @@ class DriftingLine(Statistic):
             expected_count = np.exp(np.log(_INDEPENDENT_SHARE * path_count) + log_ndtr(-largest))
             p_value = -np.expm1(-np.minimum(expected_count, _MAX_EXPECTED_PATHS))
             z = np.where(path_count > 0, exponential_score(-np.log(p_value)), np.nan)
-        block_count = -(-np.arange(power.shape[-2] + 1) * blocks.sizes["block"] // power.shape[-2])
+        first, stop = part_windows(blocks)
         return statistic_dataset(
             blocks,
             rows=axes,
-            windows=Windows(block_count[parts[:1]], block_count[parts[-1:] + 1]),
+            windows=Windows(first[parts[:1]], stop[parts[-1:]]),
             columns=_path_columns(blocks["line_frequency"].values),
             z=z[..., None, :],
             ratio=np.where(path_count > 0, largest, np.nan)[..., None, :],
@@ -95,7 +96,6 @@ class DriftingLine(Statistic):
         )
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        """Describe a drifting line."""
         first, last = region["what"].split()[1:]
         return (
             f"The spectrum of {axes_text(region['axes'])} has a drifting line {when}, from about "

@@ -38,7 +38,7 @@ def null_counts(
     """
     samples = blocks["samples"].values.astype(np.int64)
     adjacent = blocks["adjacent"].values.astype(np.int64)
-    mean = _interpolate_means(blocks["mean"].values)
+    mean = [_interpolate(row, np.isfinite(row)) for row in blocks["mean"].values]
     scatter, correlation = _neighbour_statistics(blocks, sd)
     truncated = truncated_axes(blocks)
     nothing = np.zeros(samples.shape[1])
@@ -88,10 +88,10 @@ def _neighbour_statistics(blocks: xr.Dataset, sd: Array) -> tuple[Array, Array]:
         good = np.isfinite(variance) & (variance > 0.0)
         typical = good & (blocks["outliers"].values[axis] == 0)
         good = typical if typical.any() else good
-        place = np.arange(good.size)
         if good.any():
-            scatter[axis] = np.sqrt(np.interp(place, place[good], variance[good]))
-            correlation[axis] = np.interp(place, place[good], lagged[good] / variance[good])
+            scatter[axis] = np.sqrt(_interpolate(variance, good))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                correlation[axis] = _interpolate(lagged / variance, good)
         else:
             scatter[axis] = sd[axis, 0]
             correlation[axis] = 1.0 - 0.5 * (sd[axis, 1] / sd[axis, 0]) ** 2
@@ -126,14 +126,10 @@ def _filled_zeros(
     return zeros_beyond_chance(coinciding, zeros, samples, subset, number)
 
 
-def _interpolate_means(mean: Array) -> Array:
-    """Interpolate missing means; 0 on an axis without any."""
-    out, block = np.zeros_like(mean), np.arange(mean.shape[1])
-    for row, values in enumerate(mean):
-        good = np.isfinite(values)
-        if good.any():
-            out[row] = np.interp(block, block[good], values[good])
-    return out
+def _interpolate(values: Array, good: NDArray[np.bool_]) -> Array:
+    """Interpolate between good values; 0 without any."""
+    place = np.arange(values.size)
+    return np.interp(place, place[good], values[good]) if good.any() else np.zeros(values.size)
 
 
 def _grid_chance(

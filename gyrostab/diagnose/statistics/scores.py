@@ -59,9 +59,21 @@ def window_set(block_count: int, lengths: Sequence[int], *, whole: bool = True) 
     return Windows(begin, begin + np.concatenate(length))
 
 
-def cumulative(values: Array) -> Array:
-    """Return cumulative sums over the last dimension, from 0."""
-    return np.pad(np.cumsum(values, axis=-1), [(0, 0)] * (values.ndim - 1) + [(1, 0)])
+def part_windows(blocks: xr.Dataset) -> Windows:
+    """Return the blocks of the equal parts of the record, and of the whole last."""
+    part_count, block_count = blocks.sizes["part"], blocks.sizes["block"]
+    # As the blocks were divided when the log was read.
+    edge = -(-np.arange(part_count + 1) * block_count // part_count)
+    return Windows(
+        np.append(edge[:-1], 0), np.append(np.maximum(edge[1:], edge[:-1] + 1), block_count)
+    )
+
+
+def cumulative(values: Any, axis: int = -1) -> Any:
+    """Return cumulative sums over a dimension, by default the last one, from 0."""
+    before = np.zeros(values.ndim, np.int64)
+    before[axis] = 1
+    return np.pad(np.cumsum(values, axis=axis), np.stack([before, 0 * before], axis=1))
 
 
 def moving_sum(values: Array, span: int) -> Array:
@@ -73,20 +85,15 @@ def moving_sum(values: Array, span: int) -> Array:
 
 
 def sum_over_windows(values: Any, windows: Windows, *, axis: int = -2) -> Any:
-    """Sum over each window; missing values must be zero. The blocks are along `axis`, -2 or -1.
+    """Sum over each window; missing values must be zero. The blocks are along `axis`.
 
     Examples
     --------
     >>> sum_over_windows(np.ones((4, 1)), window_set(4, (2,), whole=False))[:, 0]
     array([2., 2., 2.])
     """
-    if axis == -1:
-        return sum_over_windows(values[..., None], windows)[..., 0]
-    total = np.zeros(
-        (*values.shape[:-2], values.shape[-2] + 1, values.shape[-1]), dtype=values.dtype
-    )
-    np.cumsum(values, axis=-2, out=total[..., 1:, :])
-    return total[..., windows.stop, :] - total[..., windows.first, :]
+    total = cumulative(values, axis)
+    return np.take(total, windows.stop, axis) - np.take(total, windows.first, axis)
 
 
 def cube_root_score(ratio: Array, shape: Array) -> Array:

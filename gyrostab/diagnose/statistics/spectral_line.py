@@ -35,6 +35,7 @@ from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     cumulative,
     moving_sum,
+    part_windows,
     statistic_dataset,
     sum_over_windows,
 )
@@ -66,7 +67,7 @@ class SpectralLine(Statistic):
         """
         power, weight = blocks["line_power"].values, blocks["line_weight"].values
         frequency = blocks["line_frequency"].values
-        windows = _part_windows(blocks)
+        windows = part_windows(blocks)
         expected = expected_lines(baseline, frequency)[:, None, :]
         flat = power / expected
         present = np.isfinite(flat) & (weight > 0)[..., None]
@@ -133,7 +134,6 @@ class SpectralLine(Statistic):
         ]
 
     def condition(self, state: State, component: Component) -> State:
-        """Condition on a spectral line."""
         frequency = float(state.blocks["line_frequency"].values[component.place])
         axis = component.row[0]
         density = bands_at(state, np.asarray(frequency)).astype(float)
@@ -220,22 +220,11 @@ class SpectralLine(Statistic):
         return tau, tau
 
     def describe(self, region: Region, when: str) -> str:
-        """Describe a line."""
         return (
             f"The spectrum of {axes_text(region['axes'])} has a line at "
             f"{region.get('frequency', np.nan):.5g} Hz {when}, at {region['ratio']:.3g} times the "
             "noise level"
         )
-
-
-def _part_windows(blocks: xr.Dataset) -> Windows:
-    """Return the blocks of the equal parts of the record, and of the whole last."""
-    part_count, block_count = blocks.sizes["part"], blocks.sizes["block"]
-    # As the blocks were divided when the log was read.
-    edge = -(-np.arange(part_count + 1) * block_count // part_count)
-    return Windows(
-        np.append(edge[:-1], 0), np.append(np.maximum(edge[1:], edge[:-1] + 1), block_count)
-    )
 
 
 def _equal_block_share(blocks: xr.Dataset, windows: Windows) -> Array:
