@@ -239,6 +239,9 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
         for statistic in STATISTICS
         for name, values in statistic.null(draw).items()
     }
+    for name, (_, values) in variables.items():
+        if values.dtype.kind in "fc":
+            values[..., np.isnan(blocks[name].values)] = np.nan
     return blocks.assign(
         {
             name: (("record", *dims), values, blocks[name].attrs)
@@ -306,7 +309,6 @@ def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.G
                 rng.standard_normal((n, 2)), memory / step, float(rng.standard_normal())
             )
             total[place] += np.sqrt(square) * wander
-    total[..., np.isnan(blocks["mean"].values)] = np.nan
     return np.asarray(total)
 
 
@@ -362,9 +364,7 @@ def _draw_cross(
     size = np.sqrt(level[:, first] * level[:, second])
     if between is None:
         between = draw_coherency(setup.blocks["cross_shape"].values, size.shape, rng)
-    cross = size * between
-    cross[..., np.isnan(setup.blocks["cross"].values)] = np.nan
-    return np.asarray(cross)
+    return np.asarray(size * between)
 
 
 def _widen_tails(score: Array, n: Array) -> Array:
@@ -394,5 +394,4 @@ def _draw_kurtosis(setup: _NullSetup, count: int, rng: np.random.Generator) -> A
         good = recorded[axis][np.isfinite(recorded[axis])]
         if step > COARSE_STEP_SIGMA * setup.sd[axis, 0] and good.size:
             out[:, axis] = rng.choice(good, out[:, axis].shape)
-    out[..., np.isnan(recorded)] = np.nan
     return np.asarray(out)

@@ -6,7 +6,7 @@ columns are those of a `State`: the current model of the noise, and the effects 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar, cast
 
@@ -166,32 +166,40 @@ def real_and_imaginary(values: Array, axis: int = -1) -> Array:
     return np.concatenate([values.real, values.imag], axis=axis)
 
 
-def given_columns(
-    state: State,
-    statistic: str,
-    row: tuple[str, ...],
-    shape: tuple[int, ...],
+def linear_model(
+    values: Array,
+    weight: Array,
+    designs: Iterable[Iterable[Array]],
+    given: Sequence[Array],
+    *,
     known: Sequence[Array] = (),
     precision: Any = (),
-) -> Any:
-    """Return given columns (block, cell, column), known ones and named effects, and precision."""
-    named_columns = state.given.get((statistic, ",".join(row)), [])
-    columns = [np.broadcast_to(column, shape) for column in [*known, *named_columns]]
-    given = np.stack(columns, axis=-1) if columns else np.empty((*shape, 0))
-    return given, np.diag([*precision, *[-1.0] * len(named_columns)])
+) -> LinearModel:
+    """Return a linear model of cells (block, cell) from columns of any shape that suits them.
+
+    The given columns are known ones with a prior precision, and nearly free ones of named effects.
+    """
+    return LinearModel(
+        values,
+        weight,
+        [stack_columns(design, weight.shape) for design in designs],
+        stack_columns([*known, *given], weight.shape),
+        np.diag([*precision, *[-1.0] * len(given)]),
+    )
 
 
-def stack_columns(columns: Sequence[Array], shape: tuple[int, ...]) -> Array:
+def stack_columns(columns: Iterable[Array], shape: tuple[int, ...]) -> Array:
     """Stack columns as (block, cell, column)."""
-    return np.stack([np.broadcast_to(column, shape) for column in columns], axis=-1)
+    stacked = [np.broadcast_to(column, shape) for column in columns]
+    return np.stack(stacked, axis=-1) if stacked else np.empty((*shape, 0))
 
 
-def stack_designs(
-    candidates: Sequence[Candidate], shape: tuple[int, ...], make_column: Callable[[Array], Array]
-) -> list[Array]:
-    """Return the designs (block, cell, column) of all variants, in order."""
+def variant_designs(
+    candidates: Sequence[Candidate], make_column: Callable[[Array], Array] = np.asarray
+) -> list[list[Array]]:
+    """Return the columns of the designs of all variants, in order."""
     return [
-        stack_columns([make_column(design) for design in variant.design], shape)
+        [make_column(column) for column in variant.design]
         for candidate in candidates
         for variant in candidate.variants
     ]

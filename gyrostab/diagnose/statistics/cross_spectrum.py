@@ -22,15 +22,15 @@ from gyrostab.diagnose.predict.linear_model import (
     band_widths,
     cross_column,
     expected_cross,
-    given_columns,
+    linear_model,
     mix_with_mean,
     pair_rows,
     power_column,
     real_and_imaginary,
     records_last,
     select_row,
-    stack_designs,
     unspread_share,
+    variant_designs,
 )
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
@@ -134,13 +134,11 @@ class CrossSpectrum(Statistic):
             yield Variant(case.values, (name,), with_axis(density)[None], squared=True)
 
     def rows(self, candidate: Candidate, state: State) -> list[tuple[str, ...]]:
-        """Return the two axes of each pair."""
         return pair_rows(state.blocks)
 
     def model(
         self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
     ) -> LinearModel:
-        """Build the model of the cross-spectrum of a pair of axes."""
         pair = pair_rows(state.blocks)[row]
         i, j = (state.axes.index(axis) for axis in pair)
         expected = expected_cross(state.baseline)
@@ -155,19 +153,17 @@ class CrossSpectrum(Statistic):
         variance = np.concatenate([noise_product + shared_product, in_quadrature], axis=1)
         weight = np.tile(2.0 * shape, 2) / variance
         weight = np.where((state.masked[i] | state.masked[j])[:, None], 0.0, weight)
-        given, precision = given_columns(state, "cross", pair, weight.shape)
         unspread, width = unspread_share(state.blocks, "pair")[row], band_widths(state.blocks)
-        designs = stack_designs(
+        designs = variant_designs(
             candidates,
-            weight.shape,
             lambda density: real_and_imaginary(
                 mix_with_mean(select_row(density, row) + 0j, unspread, width)
             ),
         )
-        return LinearModel(real_and_imaginary(values, axis=1), weight, designs, given, precision)
+        given = state.given.get(("cross", ",".join(pair)), [])
+        return linear_model(real_and_imaginary(values, axis=1), weight, designs, given)
 
     def condition(self, state: State, component: Component) -> State:
-        """Condition on a component in the cross-spectra."""
         row = pair_rows(state.blocks).index(component.row)
         columns = []
         for density in component.variant.design:
@@ -199,7 +195,6 @@ class CrossSpectrum(Statistic):
         return estimate_shared_factors(fit.components, fit.axes, fit.state)
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        """Describe axes that vary together."""
         estimate = region.get("estimate", np.nan)
         size = f" (coherency {estimate:.2g})" if np.isfinite(estimate) else ""
         return (
@@ -278,13 +273,9 @@ def draw_coherency(
 
 def _covariance_variants(bands: int) -> tuple[Variant, ...]:
     """Return covariances in each band, or in four groups of bands, with any phase."""
-    single_bands = [np.eye(bands)[number] for number in range(bands)]
-    groups = [
-        np.isin(np.arange(bands), group).astype(float)
-        for group in np.array_split(np.arange(bands), min(4, bands))
-    ]
-    variants = [_any_phase([band]) for band in single_bands]
-    return (*variants, _any_phase(groups))
+    single_bands = np.eye(bands)
+    groups = [part.sum(axis=0) for part in np.array_split(single_bands, min(4, bands))]
+    return (*(_any_phase([band]) for band in single_bands), _any_phase(groups))
 
 
 def _any_phase(rows: list[Array]) -> Variant:

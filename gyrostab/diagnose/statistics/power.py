@@ -17,13 +17,13 @@ from gyrostab.diagnose.predict.filter_response import undo_filter
 from gyrostab.diagnose.predict.linear_model import (
     State,
     band_widths,
-    given_columns,
+    linear_model,
     mix_with_mean,
     power_column,
     records_last,
     select_row,
-    stack_designs,
     unspread_share,
+    variant_designs,
 )
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, column_choices
@@ -93,11 +93,9 @@ class Power(Statistic):
     def competitors(
         self, components: Sequence[Component], state: State, error: float
     ) -> Iterator[Competitor]:
-        """Yield a filter for each axis."""
         return separate_filters(components, state)
 
     def axis_competitors(self, component: Component, state: State) -> Iterator[Competitor]:
-        """Yield other sizes in parts of the record."""
         return parts_of_record(component, state)
 
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
@@ -168,35 +166,32 @@ class Power(Statistic):
     def model(
         self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
     ) -> LinearModel:
-        """Build the model of the band powers of an axis."""
         axis = state.axes[row]
         expected = axis_values(state.baseline, "spectrum", axis)
         values = records_last(data["power"].values, 3)[row] - expected[..., None]
         weight = axis_values(state.baseline, "shape_alone", axis) / state.weight[row] ** 2
         weight = np.where(state.masked[row][:, None], 0.0, weight)
         level, precision = noise_columns(state.baseline, axis=axis)
-        level_columns = [level[..., number] * expected for number in range(level.shape[2])]
-        given, given_precision = given_columns(
-            state, "power", (axis,), weight.shape, level_columns, np.diagonal(precision)
-        )
         unspread, width = unspread_share(state.blocks)[row], band_widths(state.blocks)
-        designs = stack_designs(
-            candidates,
-            weight.shape,
-            lambda density: mix_with_mean(select_row(density, row), unspread, width),
+        model = linear_model(
+            values,
+            weight,
+            variant_designs(
+                candidates,
+                lambda density: mix_with_mean(select_row(density, row), unspread, width),
+            ),
+            state.given.get(("power", axis), []),
+            known=[level[..., number] * expected for number in range(level.shape[2])],
+            precision=np.diagonal(precision),
         )
-        return with_independent_cells(
-            LinearModel(values, weight, designs, given, given_precision),
-            axis_values(state.baseline, "common", axis),
-            state.weight[row],
-        )
+        common = axis_values(state.baseline, "common", axis)
+        return with_independent_cells(model, common, state.weight[row])
 
     def is_filter(self, variant: Variant) -> bool:
         """Return whether a variant has no size: what a filter does at its full size."""
         return not variant.columns
 
     def condition(self, state: State, component: Component) -> State:
-        """Condition on a component in the powers."""
         axis = component.row[0]
         row = state.axes.index(axis)
         if self.is_filter(component.variant) and "line_power" in state.blocks:
@@ -216,7 +211,6 @@ class Power(Statistic):
         )
 
     def describe(self, region: Region, when: str) -> str:
-        """Describe another Allan variance."""
         is_single = len(region["axes"]) == 1
         return (
             f"{subject(region)} {'is' if is_single else 'are'} "

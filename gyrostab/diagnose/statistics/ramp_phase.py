@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.evidence.held_out import LinearModel
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
 from gyrostab.diagnose.predict.condition import free_shape
-from gyrostab.diagnose.predict.linear_model import State, given_columns, records_last, stack_designs
+from gyrostab.diagnose.predict.linear_model import (
+    State,
+    linear_model,
+    records_last,
+    variant_designs,
+)
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.statistics.base import NullDraw, Statistic, column_choices
 from gyrostab.diagnose.statistics.rotation_order import score_orders, turns_per_second
@@ -46,18 +51,15 @@ class RampPhase(Statistic):
     is_phase_locked = True
 
     def null(self, draw: NullDraw) -> Mapping[str, Array]:
-        """Draw ramp profiles."""
         if "profile" not in draw.blocks:
             return {}
-        recorded = draw.blocks["profile"].values
         samples = draw.blocks["profile_samples"].values.astype(np.float64)
         safe = np.maximum(samples, 1.0)
-        noise = draw.rng.standard_normal((draw.record_count, *recorded.shape))
+        noise = draw.rng.standard_normal((draw.record_count, *samples.shape))
         noise = noise * draw.sample_sd[:, :1, None] / np.sqrt(safe)
         noise -= (noise * samples).sum(axis=-1, keepdims=True) / np.maximum(
             samples.sum(axis=-1), 1.0
         )[..., None]
-        noise[..., np.isnan(recorded)] = np.nan
         return {"profile": noise}
 
     def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
@@ -118,25 +120,15 @@ class RampPhase(Statistic):
     def model(
         self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
     ) -> LinearModel:
-        """Build the model of the ramp profile of an axis."""
         values = records_last(data["profile"].values, 3)[row]
         rate = float(state.blocks.attrs["sampling_rate_hz"])
         width = (state.blocks["band_high"] - state.blocks["band_low"]).values
         variance = rate * (state.weight[row] * width).sum(axis=-1) / width.sum()
         weight = state.blocks["profile_samples"].values[row] / variance[:, None]
-        given, precision = given_columns(
-            state,
-            "phase_locked",
-            (state.axes[row],),
-            weight.shape,
-            [np.ones(weight.shape[1])],
-            [-1.0],
-        )
-        designs = stack_designs(candidates, weight.shape, np.asarray)
-        return LinearModel(values, weight, designs, given, precision)
+        given = [np.ones(weight.shape[1]), *state.given.get(("phase_locked", state.axes[row]), [])]
+        return linear_model(values, weight, variant_designs(candidates), given)
 
     def condition(self, state: State, component: Component) -> State:
-        """Condition on a component in the ramp profile."""
         state = state.with_columns("phase_locked", component.row[0], list(component.variant.design))
         if "ramp_turns" in state.blocks:
             state = state.with_columns("line", "all", [_ramp_lines(state)])
@@ -162,7 +154,6 @@ class RampPhase(Statistic):
         return out, [], []
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        """Describe what is locked to the rotation or to the ramp."""
         kind = str(region["what"])
         component = (
             f"The rate of {axes_text(region['axes'])} has a component of "

@@ -17,9 +17,9 @@ from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect,
 from gyrostab.diagnose.predict.condition import free_covariance
 from gyrostab.diagnose.predict.linear_model import (
     State,
+    linear_model,
     real_and_imaginary,
     records_last,
-    stack_columns,
 )
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.block_statistics import noise_at_orders
@@ -55,12 +55,11 @@ class RotationOrder(Statistic):
         if "order" not in draw.blocks:
             return {}
         blocks, expected = draw.blocks, draw.expected
-        recorded = blocks["order"].values
         rate = float(blocks.attrs["sampling_rate_hz"])
         samples = np.maximum(blocks["samples"].values, 1)
-        turning = np.abs(np.nan_to_num(blocks["channel_rotation_rate"].values)) / 360.0
+        turning = turns_per_second(blocks)
         bands = np.log(blocks["frequency"].values)
-        density = np.empty((len(expected), *recorded.shape))
+        density = np.empty((len(expected), *blocks["order"].shape))
         for place, harmonic in enumerate(blocks["harmonic"].values):
             folded = np.abs((turning * harmonic + rate / 2.0) % rate - rate / 2.0)
             at = np.interp(np.log(np.maximum(folded, 1e-9)), bands, np.arange(bands.size))
@@ -70,11 +69,8 @@ class RotationOrder(Statistic):
                 :, :, block, low + 1
             ] * (at - low)
         noise = draw.rng.standard_normal((*density.shape, 2)) @ np.array([1.0, 1j])
-        out = np.asarray(
-            np.sqrt(2.0 * noise_at_orders(blocks, density) * rate / samples[..., None]) * noise
-        )
-        out[..., np.isnan(recorded)] = np.nan
-        return {"order": out}
+        variance = 2.0 * noise_at_orders(blocks, density) * rate / samples[..., None]
+        return {"order": np.sqrt(variance) * noise}
 
     def design(self, case: Prospect) -> Iterator[Variant]:
         """Yield patterns of the harmonics over the axes."""
@@ -111,20 +107,16 @@ class RotationOrder(Statistic):
         cell_weight = np.concatenate([weight[axis] for axis in axes for _ in range(2)], axis=1)
         if is_per_axis:
             designs = [
-                stack_columns(order_columns(np.ones(count, complex), chosen), cell_weight.shape)
-                for chosen in harmonic_sets(count)
+                order_columns(np.ones(count, complex), chosen) for chosen in harmonic_sets(count)
             ] * len(candidates)
         else:
             designs = [
-                stack_columns(
-                    [
-                        np.concatenate(columns)
-                        for columns in zip(
-                            *(order_columns(factor, (0,)) for factor in pattern), strict=True
-                        )
-                    ],
-                    cell_weight.shape,
-                )
+                [
+                    np.concatenate(columns)
+                    for columns in zip(
+                        *(order_columns(factor, (0,)) for factor in pattern), strict=True
+                    )
+                ]
                 for candidate in candidates
                 for variant in candidate.variants
                 for pattern in (variant.design[0], np.conj(variant.design[0]))
@@ -135,8 +127,7 @@ class RotationOrder(Statistic):
                 wide = np.zeros(cell_weight.shape)
                 wide[:, place * 2 * count : (place + 1) * 2 * count] = column
                 given.append(wide)
-        columns = np.stack(given, axis=-1) if given else np.empty((*cell_weight.shape, 0))
-        return LinearModel(values, cell_weight, designs, columns, -np.eye(len(given)))
+        return linear_model(values, cell_weight, designs, given)
 
     def condition(self, state: State, component: Component) -> State:
         """Condition on a component in the rotation orders, and where it shows in the spectrum.
@@ -204,9 +195,7 @@ def order_weight(state: State) -> Array:
     """Return (axis, block, harmonic): one over the variance of each part of an amplitude."""
     blocks = state.blocks
     rate, frequency = float(blocks.attrs["sampling_rate_hz"]), blocks["frequency"].values
-    place = (
-        np.abs(blocks["channel_rotation_rate"].values)[:, None] / 360.0 * blocks["harmonic"].values
-    )
+    place = turns_per_second(blocks)[:, None] * blocks["harmonic"].values
     good = (
         np.isfinite(blocks["order"].values)
         & (place * float(blocks.attrs["block_s"]) >= 2.0)

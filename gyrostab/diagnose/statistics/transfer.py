@@ -17,12 +17,12 @@ from gyrostab.diagnose.predict.condition import free_covariance
 from gyrostab.diagnose.predict.linear_model import (
     State,
     expected_cross,
-    given_columns,
+    linear_model,
     pair_rows,
     real_and_imaginary,
     records_last,
     reference_channel_power,
-    stack_designs,
+    variant_designs,
 )
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.predict.windows import distinct_variants
@@ -49,16 +49,12 @@ class Transfer(Statistic):
     explains_motion = True
 
     def null(self, draw: NullDraw) -> Mapping[str, Array]:
-        """Draw cross-spectra of axes with reference channels."""
         if "reference_cross" not in draw.blocks:
             return {}
-        recorded = draw.blocks["reference_cross"].values
         shape = draw.blocks["shape"].values
         channel_power = draw.blocks["reference_power"].values
         size = np.sqrt(draw.power[:, :, None] * channel_power)
-        cross = size * draw_coherency(shape[:, None], size.shape, draw.rng)
-        cross[..., np.isnan(recorded)] = np.nan
-        return {"reference_cross": cross}
+        return {"reference_cross": size * draw_coherency(shape[:, None], size.shape, draw.rng)}
 
     def candidates(
         self,
@@ -96,7 +92,6 @@ class Transfer(Statistic):
     def model(
         self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
     ) -> LinearModel:
-        """Build the model of the transfer from a reference channel to an axis."""
         cross, power = reference_channel_of(
             candidates[0].reference[0], row, data, state.blocks, state.baseline
         )
@@ -109,14 +104,13 @@ class Transfer(Statistic):
         weight = np.concatenate([weight, weight], axis=1)
         with np.errstate(invalid="ignore"):
             values = real_and_imaginary(cross / root[..., None], axis=1)
-        given, precision = given_columns(state, "transfer", (state.axes[row],), weight.shape)
-        designs = stack_designs(
-            candidates, weight.shape, lambda density: real_and_imaginary(density * root * share)
+        designs = variant_designs(
+            candidates, lambda density: real_and_imaginary(density * root * share)
         )
-        return LinearModel(values, weight, designs, given, precision)
+        given = state.given.get(("transfer", state.axes[row]), [])
+        return linear_model(values, weight, designs, given)
 
     def condition(self, state: State, component: Component) -> State:
-        """Condition on a transfer from a reference channel."""
         axis = component.row[0]
         power = reference_channel_power(component.candidate.reference[0], state.blocks)
         power = np.where(np.isfinite(power), power, 0.0)
