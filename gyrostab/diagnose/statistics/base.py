@@ -118,7 +118,7 @@ class Statistic:
         """Draw what noise alone produces, by variable with the record first.
 
         By default nothing: the powers, means and cross-spectra of a null record, from which most
-        statistics follow, are drawn together.
+        statistics follow, are drawn together. Values that the recording lacks are left out later.
         """
         return {}
 
@@ -193,11 +193,11 @@ class Statistic:
         factors = []
         spread = 1
         for row in range(len(rows)):
-            factors.append(self._row_factors(group, row, trial)[:, 1:])
+            factors.append(self.row_factors(group, row, trial)[:, 1:])
             spread = factors[-1].shape[1] // sum(len(candidate.variants) for candidate in group)
         return collect_evidence(group, rows, factors, spread)
 
-    def _row_factors(self, group: Sequence[Candidate], row: int, trial: Trial) -> Array:
+    def row_factors(self, group: Sequence[Candidate], row: int, trial: Trial) -> Array:
         """Return the factors of all variants in one row, as `linear_model_factors` does."""
         state = trial.state
         is_drawn = trial.rng is not None and self.null_variable not in trial.data

@@ -101,7 +101,6 @@ class CommonMode(Statistic):
         )
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        """Describe axes that drift together."""
         return (
             f"{subject(region)} drift together (correlation {region['estimate']:.2g}) {when}, at "
             f"{taus_text(region)}, which the random walks of independent gyros do not"

@@ -18,7 +18,6 @@ from gyrostab.diagnose.evidence.wandering import block_mean_variance, expected_p
 from gyrostab.diagnose.predict.candidates import (
     TIME_PARAMETER,
     Candidate,
-    CandidateEvidence,
     Component,
     Prospect,
     Variant,
@@ -26,7 +25,7 @@ from gyrostab.diagnose.predict.candidates import (
 )
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State, moves_within_blocks
-from gyrostab.diagnose.predict.search import Trial, collect_evidence
+from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.predict.sizes import mean_mixture
 from gyrostab.diagnose.predict.windows import hat_functions, power_on_times
 from gyrostab.diagnose.settings import Settings
@@ -105,7 +104,6 @@ class BlockMeanStatistic(Statistic):
         return str(region["view"]) in self.explains and bool(is_slow)
 
     def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
-        """Return the averaging times of block means."""
         return float(blocks.attrs["block_s"]), float(blocks["end"].values[-1]) / 2.0
 
 
@@ -122,7 +120,6 @@ class Mean(BlockMeanStatistic):
     def competitors(
         self, components: Sequence[Component], state: State, error: float
     ) -> Iterator[Competitor]:
-        """Yield other courses than jumps."""
         return jump_competitors(components, state, error)
 
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
@@ -176,29 +173,25 @@ class Mean(BlockMeanStatistic):
         """Let a step at a given time occur at every restart."""
         return replace(candidate, variants=_with_steps_at_restarts(candidate.variants, windows))
 
-    def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
-        """Compute the evidence in block means."""
-        factors = []
-        for row, axis in enumerate(trial.state.axes):
-            designs = [
-                np.moveaxis(variant.design[:, row if variant.design.shape[1] > 1 else 0], 0, -1)
-                for candidate in group
-                for variant in candidate.variants
-            ]
-            compute = partial(
-                mean_factors,
-                trial.data,
-                trial.state.baseline,
-                designs,
-                axis=axis,
-                given=trial.state.given_to("mean", axis),
-                folds=trial.folds,
-            )
-            factors.append(trial.recall(compute, group, *mean_inputs(trial, axis))[:, 1:])
-        return collect_evidence(group, self.rows(group[0], trial.state), factors)
+    def row_factors(self, group: Sequence[Candidate], row: int, trial: Trial) -> Array:
+        axis = trial.state.axes[row]
+        designs = [
+            np.stack(mean_columns(variant, row), axis=-1)
+            for candidate in group
+            for variant in candidate.variants
+        ]
+        compute = partial(
+            mean_factors,
+            trial.data,
+            trial.state.baseline,
+            designs,
+            axis=axis,
+            given=trial.state.given_to("mean", axis),
+            folds=trial.folds,
+        )
+        return trial.recall(compute, group, *mean_inputs(trial, axis))
 
     def describe(self, region: Region, when: str) -> str:
-        """Describe another mean, or one that wanders."""
         axes, estimate = axes_text(region["axes"]), region.get("estimate", np.nan)
         if region.get("sign", 1) == 0:
             return (

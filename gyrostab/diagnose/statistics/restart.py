@@ -63,7 +63,6 @@ class Restart(Statistic):
         )
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        """Describe a mean that does not resume where it ended."""
         return (
             f"The rate of {axes_text(region['axes'])} does not resume where it ended when the "
             f"power returns, {when}"

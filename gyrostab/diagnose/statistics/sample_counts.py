@@ -79,7 +79,6 @@ class SampleCounts(Statistic):
         return [Candidate("~outliers", self, (), (Variant({}, ("kurtosis",), np.empty(0)),))]
 
     def null(self, draw: NullDraw) -> Mapping[str, NDArray[Any]]:
-        """Draw outliers, repeats, extremes and zeros by chance."""
         return null_counts(draw.blocks, draw.sample_sd, draw.record_count, draw.rng)
 
     def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
@@ -143,7 +142,7 @@ class SampleCounts(Statistic):
         sticks = sticking_axes(trial.state.blocks)  # repeats of one value are not held samples
         out = []
         for candidate in group:
-            evidence_nats, best = [], []
+            evidence_nats = []
             for variant in candidate.variants:
                 by_name = [
                     np.where(
@@ -155,10 +154,8 @@ class SampleCounts(Statistic):
                 ]
                 evidence_nats.append(np.max(by_name, axis=0))
             place = np.argmax([by_axis[0] for by_axis in evidence_nats], axis=0)
-            best = [candidate.variants[int(number)] for number in place]
-            out.append(
-                CandidateEvidence(candidate, rows, np.max(evidence_nats, axis=0), tuple(best))
-            )
+            best = tuple(candidate.variants[int(number)] for number in place)
+            out.append(CandidateEvidence(candidate, rows, np.max(evidence_nats, axis=0), best))
         return out
 
     def condition(self, state: State, component: Component) -> State:
@@ -175,7 +172,6 @@ class SampleCounts(Statistic):
         return not find_anomalous_blocks(component, state.blocks, state.settings).any()
 
     def estimate(self, fit: SizeFit) -> Sizes:
-        """Estimate the parameters of an effect on the sample distribution."""
         return estimate_from_counts(
             fit.components[0].candidate.effect,
             fit.components[0].variant.columns[0],
@@ -190,7 +186,6 @@ class SampleCounts(Statistic):
         return bool(region["view"] == "cross_axis")
 
     def describe(self, region: Region, when: str) -> str:
-        """Describe an unusual distribution of samples."""
         samples = _SAMPLES.get(str(region["what"]), "an unusual distribution of its samples")
         verb = "has" if len(region["axes"]) == 1 else "have"
         return f"{subject(region)} {verb} {samples} {when}"

@@ -111,7 +111,6 @@ class VarianceStability(Statistic):
         return scale_to_expected(blocks, baseline, spans)
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        """Describe a noise level that fluctuates."""
         pace = length_text(float(str(region["what"]).split()[1]))
         estimate = region.get("estimate", np.nan)
         size = f" by {100.0 * estimate:.2g} % (rms)" if np.isfinite(estimate) else ""
