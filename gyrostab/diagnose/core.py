@@ -22,8 +22,9 @@ from gyrostab.diagnose.estimate.conditioned_baseline import expected_baseline, w
 from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.recalibrate import remove_fast_switching
 from gyrostab.diagnose.estimate.unexplained_motion import unexplained_motion
-from gyrostab.diagnose.identify.forward_search import identify_effects, prepare_examination
+from gyrostab.diagnose.identify.examination import prepare_examination
 from gyrostab.diagnose.identify.identification import components_of
+from gyrostab.diagnose.identify.selection import identify_effects
 from gyrostab.diagnose.inputs import check_options, read_simulation, varying_axes
 from gyrostab.diagnose.locate.mismatches import locate_mismatches
 from gyrostab.diagnose.nulls.records import repeatable_null_records

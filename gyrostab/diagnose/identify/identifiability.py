@@ -1,4 +1,4 @@
-"""Reject sizes that physics does not allow, and effects that another form explains better."""
+"""Compare an effect with other explanations: other forms, other effects, time-shifted channels."""
 
 from __future__ import annotations
 
@@ -7,17 +7,25 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.identify.examination import Examination
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.predict.sizes import component_mixture, component_size
+from gyrostab.diagnose.predict.windows import make_surrogates, max_correlation
 from gyrostab.diagnose.reduce.block_statistics import measured
+from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes
 from gyrostab.diagnose.statistics.base import Competitor
 from gyrostab.diagnose.statistics.candidates import largest_size
 from gyrostab.physics.registry import effects
 
+#: Number of time-shifted surrogates: two of them make the allowed share of 1 %.
+TIME_SHIFTS = 200
+SHIFT_RANGE = (0.05, 0.95)  # of the record
 Array = NDArray[np.float64]
 _PPM = 1e6  # in one
 
@@ -192,4 +200,157 @@ def _is_moving(axis: str, state: State) -> bool:
     return bool(
         np.nanmax(np.nanmean(measured(state.blocks, "power").values[row] / expected, axis=0))
         > state.settings.moving_power_ratio
+    )
+
+
+def find_equivalent_effects(
+    effect: str, components: Sequence[Component], state: State, *, lines: int = 0
+) -> list[str]:
+    """Return effects that the data cannot separate from this one; `lines` counts all lines."""
+    out = list(effects()[effect].look_alikes("always"))
+    blocks = state.blocks
+    if (
+        effect == "spectral_line"
+        and "profile" not in blocks
+        and lines >= state.settings.min_comb_lines
+    ):
+        out.append("feedback_reset")
+    if (
+        effect == "dead_zone" and len(state.axes) == 1
+    ):  # no other axis shows whether the sample was lost
+        out.append("held_samples")
+    if effect == "dead_zone" and any(
+        possibly_truncated_axes(blocks)[state.axes.index(component.row[0])]
+        for component in components
+    ):
+        out.append("rate_quantization")  # truncation towards zero makes the zero bin twice as wide
+    if effect == "bias_jump" and any(
+        component.is_step
+        and np.abs(component_mixture(component, state).moments()[0]).max()
+        >= state.settings.min_fringe_step
+        for component in components
+    ):
+        out.append("fringe_hop")
+    if effect == "telegraph" and not any(
+        component.statistic.is_switching for component in components
+    ):
+        out.append("gauss_markov")  # two levels show only in the means
+    if effect == "vibration_rectification":
+        vibration = blocks[f"channel_{components[0].candidate.driver[0]}"].values
+        good = np.isfinite(vibration)
+        if (
+            np.corrcoef(vibration[good], vibration[good] ** 2)[0, 1]
+            > state.settings.level_correlation
+        ):
+            out.append("g_sensitivity")
+    return out
+
+
+def find_spectral_alternatives(
+    effect: str,
+    components: Sequence[Component],
+    state: State,
+    examination: Examination,
+) -> list[str]:
+    """Return effects of the same channel, if a spectrum of another form explains clearly more.
+
+    The forms that were tried then do not tell the effects apart: vibration through the resonance of
+    a mount has a hump like an aliased band. `state` has all other effects in the model.
+    """
+    powers = [component for component in components if component.statistic.is_power]
+    others = list(effects()[effect].look_alikes("any spectrum"))
+    if not others or not powers:
+        return []
+    own_nats = sum(component.evidence_nats for component in powers)
+    free = 0.0
+    for component in powers:
+        evidence = examination.compute_evidence([_any_spectrum(component, state)], state)[0]
+        free += float(evidence.evidence_nats[0, evidence.rows.index(component.row)])
+    allowed = state.settings.ambiguous_nats + state.settings.form_error_share * own_nats
+    return others if free - own_nats > allowed else []
+
+
+def _any_spectrum(component: Component, state: State) -> Candidate:
+    """Return a power of any spectrum with the course of a component over time."""
+    design = component.variant.design
+    row = state.axes.index(component.row[0]) if design.shape[1] > 1 else 0
+    course = design[0, row].mean(axis=-1)
+    bands = np.eye(design.shape[-1])
+    variant = Variant(
+        {}, tuple(map(str, range(len(bands)))), course[None, None, :, None] * bands[:, None, None]
+    )
+    return Candidate("~S(f)", component.statistic, component.candidate.driver, (variant,))
+
+
+def passes_time_shift_test(
+    components: Sequence[Component],
+    state: State,
+    folds: xr.DataArray,
+) -> tuple[bool, float, float]:
+    """Test whether an effect explains more than time-shifted surrogates of its channel.
+
+    Parameters
+    ----------
+    components : sequence of Component
+        Components of the effect.
+    state : State
+        What is in the model without it.
+
+    Returns
+    -------
+    passed : bool
+        Also true where no surrogate can be made.
+    p_value, nats : float
+        Share of the surrogates that explain as much, and by how much the best of them explains more
+        than the channel [nats]; NaN where too few of them differ from the channel.
+    """
+    following_components = [component for component in components if _follows_channel(component)]
+    if not following_components:
+        return True, np.nan, np.nan
+    block_count = state.blocks.sizes["block"]
+    shifts = np.unique(
+        np.linspace(block_count * SHIFT_RANGE[0], block_count * SHIFT_RANGE[1], TIME_SHIFTS).astype(
+            int
+        )
+    )
+    real, shifted = 0.0, np.zeros(shifts.size)
+    valid = np.ones(shifts.size, np.bool_)
+    limit = state.settings.majority_share
+    for component in following_components:
+        surrogates = make_surrogates(component, state.blocks, state.baseline["coefficient"], shifts)
+        row = state.axes.index(component.row[0])
+        for number, surrogate in enumerate(surrogates):
+            if surrogate is None or max_correlation(surrogate, component.variant, row) > limit:
+                valid[number] = False
+        chosen = [
+            surrogate if surrogate is not None else component.variant for surrogate in surrogates
+        ]
+        shifted_candidates = [
+            replace(component.candidate, effect=f"shifted {number}", variants=(variant,))
+            for number, variant in enumerate(chosen)
+        ]
+        # all variants: the channel pays for the search of the best one, as no surrogate has to
+        all_evidence = compute_evidence(
+            [component.candidate, *shifted_candidates],
+            state.blocks,
+            state,
+            folds,
+        )
+        values = np.array([evidence.evidence_nats[0, row] for evidence in all_evidence])
+        real += float(values[0])
+        shifted += values[1:]
+    if valid.sum() < state.settings.min_surrogates:
+        return True, np.nan, np.nan
+    p_value = float(np.mean(shifted[valid] >= real))
+    nats = float(shifted[valid].max() - real)
+    return p_value <= state.settings.surrogate_share, p_value, nats
+
+
+def _follows_channel(component: Component) -> bool:
+    """Return whether a component follows a channel, or the means of other axes."""
+    if not (component.statistic.is_linear_in_means or component.statistic.is_power):
+        return False
+    follows_axes = effects()[component.candidate.effect].follows_axes
+    return any(component.candidate.driver) or (
+        component.statistic.is_linear_in_means and follows_axes
     )

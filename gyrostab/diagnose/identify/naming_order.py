@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations_with_replacement
 
 import numpy as np
 
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identifiability import find_plainer_effect
-from gyrostab.diagnose.identify.switching import identify_switching, put_followers_first
+from gyrostab.diagnose.identify.identifiability import find_plainer_effect, keep_physical
+from gyrostab.diagnose.identify.identification import (
+    form_error,
+    make_selection,
+)
 from gyrostab.diagnose.predict.candidates import Candidate, Component
-from gyrostab.diagnose.predict.condition import condition_on
+from gyrostab.diagnose.predict.condition import condition_on, mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 
 
@@ -164,3 +168,154 @@ def _confirmed_components(components: Sequence[Component], state: State) -> list
         for component in components
         if component.statistic.is_transfer and component.candidate.reference[0] not in state.axes
     ]
+
+
+def put_followers_first(
+    passing: list[str], components: Mapping[str, Sequence[Component]], state: State
+) -> list[str]:
+    """Drop telegraph biases while a passing mean that follows a channel may be their cause.
+
+    A channel that switches makes two levels as well, and because its form is not exact, what it
+    leaves switches with it. Therefore the channel comes first where it explains more on the same
+    axis, or half of the course of the switching.
+    """
+    led = [
+        component
+        for key in passing
+        for component in components[key]
+        if component.statistic.is_linear_in_means and any(component.candidate.driver)
+    ]
+    return [
+        key
+        for key in passing
+        if not any(_has_possible_cause(component, led, state) for component in components[key])
+    ]
+
+
+def _has_possible_cause(component: Component, led: Sequence[Component], state: State) -> bool:
+    others_on_axis = [
+        other for other in led if component.statistic.is_switching and other.row == component.row
+    ]
+    return any(
+        other.evidence_nats >= component.evidence_nats
+        or _explained_share(component, other, state) > state.settings.majority_share
+        for other in others_on_axis
+    )
+
+
+def _explained_share(component: Component, other: Component, state: State) -> float:
+    """Return the share of the variance of a course that another component explains."""
+    row = state.axes.index(component.row[0])
+    course = mean_columns(component.variant, row)[0]
+    other_columns = np.stack(mean_columns(other.variant, row), axis=1)
+    good = (
+        np.isfinite(state.blocks["mean"].values[row])
+        & np.isfinite(other_columns).all(axis=1)
+        & np.isfinite(course)
+    )
+    course, other_columns = (
+        course[good] - course[good].mean(),
+        other_columns[good] - other_columns[good].mean(axis=0),
+    )
+    size, *_ = np.linalg.lstsq(other_columns, course, rcond=None)
+    return float(
+        1.0
+        - np.square(course - other_columns @ size).sum()
+        / max(float(np.square(course).sum()), 1e-300)
+    )
+
+
+def identify_switching(
+    passing: list[str], components: Mapping[str, Sequence[Component]], state: State
+) -> list[str]:
+    """Return the keys of biases that switch within blocks and have no possible cause.
+
+    An axis has one of them: with it in the model, more switching does not explain powers and
+    tails that the first
+    has left, and may be a jump.
+    """
+    return [
+        key
+        for key in put_followers_first(passing, components, state)
+        if any(
+            component.variant.inside.size and not state.given.get(("sub_block", component.row[0]))
+            for component in components[key]
+        )
+    ]
+
+
+def find_pair(
+    examination: Examination,
+    passing: Sequence[str],
+    components: Mapping[str, list[Component]],
+    required: Mapping[str, float],
+    state: State,
+) -> list[tuple[str, list[Component], State]]:
+    """Find two effects that together explain more than the nuisance alternative.
+
+    Two jumps are such a pair if the alternative is a course of levels. An alternative of any form
+    explains more than each of them while the other is not in the model. The evidence of a pair is
+    the lower one of both orders: an effect that is fitted alone to both may have a form that the
+    second one has to undo.
+
+    Returns the key of each, what it explains with the other in the model, and the state with that
+    other one; nothing without such a pair.
+    """
+    alternative = components[passing[0]]
+    is_course = alternative[0].statistic.is_switching  # of levels, as jumps make it
+    keys = [
+        key
+        for key in passing
+        if not key.startswith("~")
+        and (
+            components[key][0].statistic is alternative[0].statistic
+            or (is_course and components[key][0].statistic.is_linear_in_means)
+        )
+    ]
+    companions = {
+        key: _find_beside(examination, keys, components[key], required[key], state) for key in keys
+    }
+    totals = {
+        (first, second): sum_evidence(components[first]) + sum_evidence(components_beside[second])
+        for first, (_, components_beside) in companions.items()
+        for second in components_beside
+    }
+    pairs = {
+        pair: min(totals[pair], totals[pair[::-1]])
+        for pair in combinations_with_replacement(keys, 2)
+        if pair in totals
+        and pair[::-1] in totals
+        and (pair[0] != pair[1] or (is_course and components[pair[0]][0].is_step))
+    }
+    best = max(pairs, key=lambda pair: pairs[pair], default=None)
+    if best is None or pairs[best] <= sum_evidence(alternative):
+        return []
+    first, second = best
+    with_second, beside_second = companions[second]
+    first_components = beside_second[first]
+    with_first, beside_first = _find_beside(
+        examination, [second], first_components, required[first], state
+    )
+    if second not in beside_first:
+        return []
+    return [(first, first_components, with_second), (second, beside_first[second], with_first)]
+
+
+def _find_beside(
+    examination: Examination,
+    keys: Sequence[str],
+    components: list[Component],
+    required: float,
+    state: State,
+) -> tuple[State, dict[str, list[Component]]]:
+    """Return which of some effects pass with these components in the model."""
+    chosen = [make_selection(components, required)]
+    with_first = condition_on(state, components)
+    sought = [candidate for candidate in examination.candidates if candidate.key in keys]
+    components_beside = {}
+    for key, effect_components in examination.find_components(sought, with_first).items():
+        error = form_error(effect_components, chosen, settings=examination.settings)
+        physical, _ = keep_physical(effect_components, with_first, error=error)
+        if sum_evidence(physical) > examination.threshold + error:
+            components_beside[key] = physical
+    return with_first, components_beside

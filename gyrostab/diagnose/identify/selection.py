@@ -1,4 +1,4 @@
-"""Select effects one after the other, by their evidence with all others in the model."""
+"""Identify effects one after the other, by their evidence with all others in the model."""
 
 from __future__ import annotations
 
@@ -16,24 +16,27 @@ from gyrostab.diagnose.identify.components import (
     sum_evidence,
 )
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identifiability import keep_physical
+from gyrostab.diagnose.identify.identifiability import keep_physical, passes_time_shift_test
 from gyrostab.diagnose.identify.identification import (
+    Identifications,
     Rejection,
     Selection,
     add_selection,
     make_selection,
 )
-from gyrostab.diagnose.identify.naming_order import order_passing, order_rivals
-from gyrostab.diagnose.identify.pairs import find_pair
-from gyrostab.diagnose.identify.rejected import find_rejections
-from gyrostab.diagnose.identify.settling import prune_selections, settle_selections, without_pulses
-from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
-from gyrostab.diagnose.identify.switching import drop_explained_jumps
-from gyrostab.diagnose.identify.withdrawal import withdraw_effects
-from gyrostab.diagnose.predict.candidates import CandidateEvidence, Component
+from gyrostab.diagnose.identify.naming_order import find_pair, order_passing, order_rivals
+from gyrostab.diagnose.identify.settling import find_rejections, prune_selections, settle_selections
+from gyrostab.diagnose.identify.withdrawal import (
+    drop_explained_jumps,
+    withdraw_effects,
+    without_pulses,
+)
+from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.physics.base import Effect
 
+MAX_ROUNDS_PER_EFFECT = 6  # components of one kind that an effect may add, one in each round
 # Limits of the time of a search; a record has fewer effects.
 MAX_EFFECTS = 10
 #: Lines are counted apart: whatever rotates or switches makes combs of them.
@@ -248,3 +251,76 @@ def _find_shifted(
 
 def _positive_evidence(evidence: CandidateEvidence) -> float:
     return float(np.maximum(evidence.evidence_nats[0], 0.0).sum())
+
+
+def identify_effects(examination: Examination) -> Identifications:
+    """Identify the effects that a recording shows beyond its baseline.
+
+    Effects are selected one after the other by how much better they predict held-out data.
+    """
+    examination = identify_expected_effects(examination)
+    identified, unidentified, rejected, state = select_effects(examination)
+    return Identifications(
+        tuple(identified),
+        tuple(unidentified),
+        examination.threshold,
+        examination.null_best,
+        examination.reasons,
+        tuple(examination.candidates),
+        state,
+        examination.count_evidence,
+        examination.expected,
+        tuple(rejected),
+    )
+
+
+def identify_expected_effects(examination: Examination) -> Examination:
+    """Identify effects that are expected, and put them into the model before any others.
+
+    Their sizes are free: the model says how often something happens, and the recording when. The
+    strongest comes first, but anomalous samples before all others, because they raise powers and
+    means too. An effect with several components of a kind, such as two jumps, is taken as long as
+    it adds evidence.
+    """
+    identified: list[Selection] = []
+    state, remaining = examination.start, list(examination.known)
+    needed = examination.settings.component_nats
+    rounds = MAX_ROUNDS_PER_EFFECT * len(remaining)
+    while remaining and rounds > 0:
+        rounds -= 1
+        choices = [(_best_components(effect, examination, state), effect) for effect in remaining]
+        choices = [choice for choice in choices if sum_evidence(choice[0]) > needed]
+        if not choices:
+            break
+        components, effect = max(
+            choices, key=lambda choice: (choice[0][0].statistic.is_count, sum_evidence(choice[0]))
+        )
+        identified.append(make_selection(components, needed, order=state.axes))
+        state = condition_on(state, components)
+        # counts of anomalous samples cannot be taken out
+        ended = effect if components[0].statistic.is_count else None
+        remaining = [other for _, other in choices if other is not ended]
+    return replace(examination, expected=tuple(identified), start=state)
+
+
+def _is_candidate_of(candidate: Candidate, effect: Effect) -> bool:
+    """Return whether a candidate is this effect with its channels, or its single event."""
+    named = {*filter(None, candidate.driver)}
+    names = (effect.name, *effect.look_alikes("single event"))
+    return candidate.effect in names and named <= {*effect.channel_names().values()}
+
+
+def _best_components(effect: Effect, examination: Examination, state: State) -> list[Component]:
+    """Return the components of an effect with the most evidence on its axes."""
+    candidates = [
+        candidate for candidate in examination.candidates if _is_candidate_of(candidate, effect)
+    ]
+    components_on_axes = [
+        [
+            component
+            for component in components
+            if not effect.axes or set(component.row) <= set(effect.axes)
+        ]
+        for components in examination.find_components(candidates, state).values()
+    ]
+    return max(components_on_axes, key=sum_evidence, default=[])

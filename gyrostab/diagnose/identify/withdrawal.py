@@ -1,10 +1,18 @@
-"""Withdraw identified effects that leave structure in time."""
+"""Withdraw selections that others explain, and effects that leave structure in time."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
-from gyrostab.diagnose.identify.components import split_layers, sum_evidence
+import numpy as np
+
+from gyrostab.diagnose.identify.components import (
+    axes_of,
+    split_layers,
+    sum_evidence,
+)
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import (
     Selection,
@@ -12,16 +20,119 @@ from gyrostab.diagnose.identify.identification import (
     make_selection,
     reduce_selection,
 )
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.statistics.jump_forms import is_free_jump
 from gyrostab.diagnose.statistics.left_structure import (
     excess_low_frequency_noise,
     variance_fluctuation,
     with_neighbouring_variants,
 )
+from gyrostab.diagnose.statistics.telegraph import search_block_means
 from gyrostab.physics.registry import effects
 
 #: Arbitrary courses of the bias.
 _DRIFTS = ("~bias(t)", "~levels")
+
+
+def without_pulses(chosen: Sequence[Selection], settings: Settings) -> list[Selection]:
+    """Drop spikes on axes that have a comb of lines or a profile of the feedback ramp.
+
+    A comb is a periodic pulse, and the outliers are the pulse itself. Bad samples would make no
+    lines.
+    """
+    lines: Counter[str] = Counter()
+    for component in components_of(chosen):
+        has_profile = component.statistic.is_phase_locked and not component.statistic.is_rotation
+        weight = settings.min_comb_lines if has_profile else int(component.statistic.is_line)
+        lines.update(dict.fromkeys(component.row, weight))
+    out: list[Selection] = []
+    for selection in chosen:
+        if selection.effect != "spikes":
+            out.append(selection)
+            continue
+        remaining = [
+            component
+            for component in selection.components
+            if lines[component.row[0]] < settings.min_comb_lines
+        ]
+        if remaining:
+            axes = [component.row[0] for component in remaining]
+            out.append(reduce_selection(selection, remaining, axes))
+    return out
+
+
+def drop_explained_jumps(chosen: Sequence[Selection], examination: Examination) -> list[Selection]:
+    """Drop jumps that a telegraph bias on their axis explains when fitted without them.
+
+    The first and the last of a few switches are jumps of the same step, and a telegraph bias that
+    is fitted with them in the model lacks these switches. The selections have the evidence with
+    which they were selected.
+    """
+    out = list(chosen)
+    for component in [
+        component for component in components_of(chosen) if component.statistic.is_switching
+    ]:
+        jumps = [
+            other
+            for other in components_of(out)
+            if other.row == component.row and is_free_jump(other, examination.start)
+        ]
+        for dropped_jumps in [jumps, *([jump] for jump in jumps if len(jumps) > 1)]:
+            if not dropped_jumps or not {*dropped_jumps} <= {*components_of(out)}:
+                continue
+            with_jumps, without_jumps = (
+                examination.state_with(_drop_components(out, left_out))
+                for left_out in ([component], [component, *dropped_jumps])
+            )
+            # in block means: sub-blocks know more, and are not always available
+            own_nats, nats_without = (
+                float(search_block_means(state, component.row[0])[0][0])
+                for state in (with_jumps, without_jumps)
+            )
+            if (
+                np.isfinite(own_nats)
+                and own_nats + sum(jump.evidence_nats for jump in dropped_jumps)
+                < nats_without + examination.threshold
+            ):
+                (evidence,) = examination.compute_evidence([component.candidate], without_jumps)
+                row = evidence.rows.index(component.row)
+                instead = replace(
+                    component,
+                    variant=evidence.best[row],
+                    evidence_nats=float(evidence.evidence_nats[0, row]),
+                )
+                out = [
+                    replace(
+                        selection,
+                        components=tuple(
+                            instead if other is component else other
+                            for other in selection.components
+                        ),
+                    )
+                    for selection in _drop_components(out, dropped_jumps)
+                ]
+                component = instead
+    return out
+
+
+def _drop_components(chosen: Sequence[Selection], left_out: Sequence[Component]) -> list[Selection]:
+    """Drop some components from the selections, and selections that lose all."""
+    out = []
+    for selection in chosen:
+        remaining = [component for component in selection.components if component not in left_out]
+        if len(remaining) < len(selection.components):
+            evidence_nats = (
+                selection.evidence_nats
+                - sum(component.evidence_nats for component in selection.components)
+                + sum(component.evidence_nats for component in remaining)
+            )
+            axes = axes_of(remaining, selection.axes)
+            selection = reduce_selection(selection, remaining, axes, evidence_nats)
+        if remaining:
+            out.append(selection)
+    return out
 
 
 def withdraw_effects(

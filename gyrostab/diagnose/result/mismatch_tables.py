@@ -8,12 +8,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.identify.identification import (
-    Identifications,
-    Selection,
-    components_of,
-)
-from gyrostab.diagnose.identify.nuisance_alternatives import NUISANCE_ALTERNATIVES
+from gyrostab.diagnose.identify.examination import NUISANCE_ALTERNATIVES
+from gyrostab.diagnose.identify.identification import Identifications, Selection, components_of
 from gyrostab.diagnose.locate.regions import Region
 from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
 from gyrostab.diagnose.reduce.block_statistics import iso, measured

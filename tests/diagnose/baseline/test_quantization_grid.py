@@ -10,7 +10,7 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.quantization_grid import angle_share, rounded_rates
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
-from gyrostab.diagnose.identify.ambiguity import find_equivalent_effects
+from gyrostab.diagnose.identify.identifiability import find_equivalent_effects
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log

@@ -14,8 +14,8 @@ from gyrostab.diagnose.evidence.spectral_lines import line_evidence, line_skirt
 from gyrostab.diagnose.evidence.wandering import with_walk
 from gyrostab.diagnose.identify import selection
 from gyrostab.diagnose.identify.components import merge_lines
+from gyrostab.diagnose.identify.examination import nuisance_alternatives
 from gyrostab.diagnose.identify.identification import Selection, add_selection, form_error
-from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import undo_filter

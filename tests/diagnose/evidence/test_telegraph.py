@@ -13,7 +13,8 @@ from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.evidence.telegraph import telegraph_courses, telegraph_evidence
 from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.identification import Identifications, Selection
-from gyrostab.diagnose.identify.switching import drop_explained_jumps, put_followers_first
+from gyrostab.diagnose.identify.naming_order import put_followers_first
+from gyrostab.diagnose.identify.withdrawal import drop_explained_jumps
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on_components
 from gyrostab.diagnose.predict.linear_model import State

@@ -10,8 +10,7 @@ from scipy.signal import lfilter
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import sum_evidence
-from gyrostab.diagnose.identify.identifiability import keep_physical
-from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
+from gyrostab.diagnose.identify.identifiability import keep_physical, passes_time_shift_test
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state

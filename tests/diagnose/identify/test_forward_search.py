@@ -15,9 +15,12 @@ from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.evidence.sample_counts import expected_counts, sample_count_evidence
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
 from gyrostab.diagnose.identify import identifiability
-from gyrostab.diagnose.identify.identifiability import _is_possible, keep_physical
+from gyrostab.diagnose.identify.identifiability import (
+    _is_possible,
+    keep_physical,
+    passes_time_shift_test,
+)
 from gyrostab.diagnose.identify.identification import Selection
-from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
 from gyrostab.diagnose.predict import search
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on

@@ -13,8 +13,8 @@ from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
+from gyrostab.diagnose.identify.examination import nuisance_alternatives
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, keep_physical
-from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log

@@ -12,9 +12,8 @@ from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify import selection as selecting
-from gyrostab.diagnose.identify.examination import Examination
+from gyrostab.diagnose.identify.examination import Examination, nuisance_alternatives
 from gyrostab.diagnose.identify.identification import make_selection
-from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
 from gyrostab.diagnose.identify.settling import prune_selections, settle_selections
 from gyrostab.diagnose.identify.withdrawal import _without_part_of_drift, withdraw_effects
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant

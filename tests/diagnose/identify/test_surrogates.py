@@ -7,8 +7,8 @@ import numpy as np
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify import surrogates
-from gyrostab.diagnose.identify.surrogates import passes_time_shift_test
+from gyrostab.diagnose.identify import identifiability
+from gyrostab.diagnose.identify.identifiability import passes_time_shift_test
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -66,7 +66,7 @@ def test_unrelated_channel_fails():
 def test_an_unrelated_channel_is_no_better_than_its_surrogates(monkeypatch):
     """An unrelated channel explains as much as half of its surrogates, whatever time constants are
     tried."""
-    monkeypatch.setattr(surrogates, "TIME_SHIFTS", 60)
+    monkeypatch.setattr(identifiability, "TIME_SHIFTS", 60)
     model = {"noise": {"N": 0.003, "B": 0.004, "K": 0.02}, "log": {"axes": ["x"]}}
 
     def p_value(seed: int) -> float:

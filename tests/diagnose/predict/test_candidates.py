@@ -9,7 +9,7 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.held_out import linear_model_factors
-from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
+from gyrostab.diagnose.identify.examination import nuisance_alternatives
 from gyrostab.diagnose.predict.linear_model import (
     initial_state,
     power_column,

@@ -10,9 +10,8 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
-from gyrostab.diagnose.identify.ambiguity import find_equivalent_effects
 from gyrostab.diagnose.identify.components import sum_evidence
-from gyrostab.diagnose.identify.identifiability import keep_physical
+from gyrostab.diagnose.identify.identifiability import find_equivalent_effects, keep_physical
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.sizes import component_mixture

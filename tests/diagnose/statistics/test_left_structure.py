@@ -12,8 +12,7 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.nuisance_alternatives import nuisance_alternatives
+from gyrostab.diagnose.identify.examination import Examination, nuisance_alternatives
 from gyrostab.diagnose.identify.selection import score_candidates
 from gyrostab.diagnose.predict.candidates import CandidateEvidence
 from gyrostab.diagnose.predict.condition import refit_weights
