@@ -161,19 +161,13 @@ def with_axes_of(
     components = [
         component for component in identification.components if set(component.row) <= shown_axes
     ]
-    if not components:
-        return identification
-    axes = [axis for axis in identification.axes if axis in shown_axes]
-    return reduce_selection(identification, components, axes)
+    return reduce_selection(identification, components) if components else identification
 
 
 def reduce_selection(
-    selection: Selection,
-    components: Iterable[Component],
-    axes: Iterable[str],
-    evidence_nats: float | None = None,
+    selection: Selection, components: Sequence[Component], evidence_nats: float | None = None
 ) -> Selection:
-    """Return a selection with some of its components and axes, and perhaps other evidence.
+    """Return a selection with some of its components, on their axes, and perhaps other evidence.
 
     Its alternatives are compared with it, and lose the same axes.
     """
@@ -182,7 +176,7 @@ def reduce_selection(
     change_nats = evidence_nats - selection.evidence_nats
     return replace(
         selection,
-        axes=tuple(axes),
+        axes=axes_of(components, selection.axes),
         components=tuple(components),
         evidence_nats=evidence_nats,
         instead={key: nats + change_nats for key, nats in selection.instead.items()},

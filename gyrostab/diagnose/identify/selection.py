@@ -19,7 +19,6 @@ from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import keep_physical, passes_time_shift_test
 from gyrostab.diagnose.identify.identification import (
     Identifications,
-    Rejection,
     Selection,
     add_selection,
     make_selection,
@@ -36,30 +35,22 @@ from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.physics.base import Effect
 
-MAX_ROUNDS_PER_EFFECT = 6  # components of one kind that an effect may add, one in each round
 # Limits of the time of a search; a record has fewer effects.
 MAX_EFFECTS = 10
+MAX_ROUNDS_PER_EFFECT = 6  # components of one kind that an expected effect may add, one each round
 #: Lines are counted apart: whatever rotates or switches makes combs of them.
 MAX_LINES = 40
 #: Sample counts of zeros: a sample is zero for one reason only.
 _ZERO_COUNTS = {"stuck", "filled"}
 
 
-def select_effects(
-    examination: Examination,
-) -> tuple[list[Selection], list[Selection], list[Rejection], State]:
-    """Select effects until none passes, then test each again with the others.
+def identify_effects(examination: Examination) -> Identifications:
+    """Identify the effects that a recording shows beyond its baseline.
 
-    Returns
-    -------
-    identified : list of Selection
-        The strongest first.
-    unidentified : list of Selection
-    rejected : list of Rejection
-        What beats each of the other effects.
-    state : State
-        With all of these in the model.
+    Effects are selected one after the other, by how much better they predict held-out data, until
+    none passes. Then each is tested again with the others.
     """
+    examination = identify_expected_effects(examination)
     selected, beaten = _select_all(examination)
     chosen = without_pulses(drop_explained_jumps(selected, examination), examination.settings)
     chosen, identified = settle_selections(examination, prune_selections(examination, chosen))
@@ -73,7 +64,18 @@ def select_effects(
     all_evidence = score_candidates(examination, state, ())
     components = merge_lines(group_components(all_evidence, settings=examination.settings))
     rejected = find_rejections(components, remaining, unidentified, beaten, state, examination)
-    return remaining, unidentified, rejected, state
+    return Identifications(
+        tuple(remaining),
+        tuple(unidentified),
+        examination.threshold,
+        examination.null_best,
+        examination.reasons,
+        tuple(examination.candidates),
+        state,
+        examination.count_evidence,
+        examination.expected,
+        tuple(rejected),
+    )
 
 
 def _select_all(
@@ -251,27 +253,6 @@ def _find_shifted(
 
 def _positive_evidence(evidence: CandidateEvidence) -> float:
     return float(np.maximum(evidence.evidence_nats[0], 0.0).sum())
-
-
-def identify_effects(examination: Examination) -> Identifications:
-    """Identify the effects that a recording shows beyond its baseline.
-
-    Effects are selected one after the other by how much better they predict held-out data.
-    """
-    examination = identify_expected_effects(examination)
-    identified, unidentified, rejected, state = select_effects(examination)
-    return Identifications(
-        tuple(identified),
-        tuple(unidentified),
-        examination.threshold,
-        examination.null_best,
-        examination.reasons,
-        tuple(examination.candidates),
-        state,
-        examination.count_evidence,
-        examination.expected,
-        tuple(rejected),
-    )
 
 
 def identify_expected_effects(examination: Examination) -> Examination:

@@ -141,14 +141,6 @@ def _finish_identification(
     )
 
 
-def evidence_instead(
-    examination: Examination, selection: Selection, chosen: Sequence[Selection]
-) -> dict[str, float]:
-    """Return the evidence [nats] of candidates in the place of one of the selections, by key."""
-    state = examination.state_with(chosen, without=selection)
-    return _sum_by_key(_find_instead(examination, selection, state)[0])
-
-
 def _find_instead(
     examination: Examination, selection: Selection, state: State
 ) -> tuple[dict[str, list[Component]], State]:
@@ -215,15 +207,13 @@ def find_rejections(
     `beaten`. `components` of every candidate and `state` have all selections in the model.
     """
     settled: list[Selection] = [*identified, *unidentified]
-    chosen: list[Selection] = [
-        *identified,
-        *(
-            replace(selection, instead=evidence_instead(examination, selection, settled))
-            if selection.components
-            else selection
-            for selection in unidentified
-        ),
-    ]
+    chosen: list[Selection] = [*identified]
+    for selection in unidentified:
+        if selection.components:
+            without = examination.state_with(settled, without=selection)
+            instead_of_it, _ = _find_instead(examination, selection, without)
+            selection = replace(selection, instead=_sum_by_key(instead_of_it))
+        chosen.append(selection)
     named = {
         selection.effect for selection in (*examination.expected, *chosen) if selection.is_named
     }

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from gyrostab.diagnose.identify.components import (
-    axes_of,
     split_layers,
     sum_evidence,
 )
@@ -58,8 +57,7 @@ def without_pulses(chosen: Sequence[Selection], settings: Settings) -> list[Sele
             if lines[component.row[0]] < settings.min_comb_lines
         ]
         if remaining:
-            axes = [component.row[0] for component in remaining]
-            out.append(reduce_selection(selection, remaining, axes))
+            out.append(reduce_selection(selection, remaining))
     return out
 
 
@@ -128,8 +126,7 @@ def _drop_components(chosen: Sequence[Selection], left_out: Sequence[Component])
                 - sum(component.evidence_nats for component in selection.components)
                 + sum(component.evidence_nats for component in remaining)
             )
-            axes = axes_of(remaining, selection.axes)
-            selection = reduce_selection(selection, remaining, axes, evidence_nats)
+            selection = reduce_selection(selection, remaining, evidence_nats)
         if remaining:
             out.append(selection)
     return out
@@ -279,8 +276,7 @@ def _without_part_of_drift(
         ]
         evidence_nats = sum(max(sum_evidence(layer), 0.0) for layer in split_layers(elsewhere))
         if evidence_nats >= threshold:
-            axes = [name for name in identification.axes if name != axis]
-            remaining.append(reduce_selection(identification, elsewhere, axes, evidence_nats))
+            remaining.append(reduce_selection(identification, elsewhere, evidence_nats))
     return remaining
 
 

@@ -63,27 +63,25 @@ def keep_supported(
     identified: list[Selection] = []
     unknown: list[Selection] = []
     rejected: list[Rejection] = []
-    changed = False
     for identification, numbers in zip(identifications.identified, fitted, strict=True):
         good = {axis for fitted_effect in numbers for axis in supported_axes(fitted_effect)}
-        supported = tuple(
-            component for component in identification.components if set(component.row) <= good
-        )
         if set(identification.axes) <= good or not numbers:
             identified.append(identification)
             continue
-        lost = tuple(
-            component for component in identification.components if component not in supported
-        )
+        supported = [
+            component for component in identification.components if set(component.row) <= good
+        ]
         if sum_evidence(supported) > identification.threshold:
-            axes = [axis for axis in identification.axes if axis in good]
             evidence_nats = min(identification.evidence_nats, sum_evidence(supported))
-            identified.append(reduce_selection(identification, supported, axes, evidence_nats))
+            identified.append(reduce_selection(identification, supported, evidence_nats))
         else:
-            lost = identification.components
+            supported = []
             rejected.append(
                 Rejection(identification.effect, identification.axes, "a size of zero", math.nan)
             )
+        lost = tuple(
+            component for component in identification.components if component not in supported
+        )
         if sum_evidence(lost) > identification.threshold:
             strongest = max(lost, key=lambda component: component.evidence_nats).statistic
             unknown.append(
@@ -97,8 +95,7 @@ def keep_supported(
                     (identification.effect,),
                 )
             )
-        changed = True
-    if not changed:
+    if identified == [*identifications.identified]:
         return identifications
     return replace(
         identifications,
