@@ -19,11 +19,7 @@ from gyrostab.diagnose.baseline.quiescent import (
     given_quiescent_blocks,
     noise_level_excess,
 )
-from gyrostab.diagnose.evidence.spectral_lines import (
-    expected_lines,
-    line_evidence,
-    line_skirt,
-)
+from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_evidence, line_skirt
 from gyrostab.diagnose.predict.linear_model import band_widths, unspread_share
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables, weighted_mean

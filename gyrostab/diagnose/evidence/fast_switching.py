@@ -15,12 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.products import (
-    WIDTHS,
-    marginalise,
-    mean_products,
-    scale_columns,
-)
+from gyrostab.diagnose.evidence.products import WIDTHS, marginalise, mean_products, scale_columns
 from gyrostab.diagnose.evidence.telegraph import (
     TelegraphCourses,
     course_evidence,

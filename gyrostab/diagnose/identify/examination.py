@@ -14,11 +14,7 @@ from gyrostab.diagnose.baseline.quantization_grid import rounded_rates
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import EXPECTED, CountEvidence, has_coarse_grid
 from gyrostab.diagnose.identify.components import group_components
-from gyrostab.diagnose.identify.identification import (
-    Selection,
-    condition_on_selections,
-    form_error,
-)
+from gyrostab.diagnose.identify.identification import Selection, condition_on_selections, form_error
 from gyrostab.diagnose.nulls.scores import fit_best_evidence
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state

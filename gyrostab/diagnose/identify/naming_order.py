@@ -10,10 +10,7 @@ import numpy as np
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, keep_physical
-from gyrostab.diagnose.identify.identification import (
-    form_error,
-    make_selection,
-)
+from gyrostab.diagnose.identify.identification import form_error, make_selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on, mean_columns
 from gyrostab.diagnose.predict.linear_model import State
@@ -188,19 +185,17 @@ def put_followers_first(
     return [
         key
         for key in passing
-        if not any(_has_possible_cause(component, led, state) for component in components[key])
+        if not any(
+            component.statistic.is_switching
+            and other.row == component.row
+            and (
+                other.evidence_nats >= component.evidence_nats
+                or _explained_share(component, other, state) > state.settings.majority_share
+            )
+            for component in components[key]
+            for other in led
+        )
     ]
-
-
-def _has_possible_cause(component: Component, led: Sequence[Component], state: State) -> bool:
-    others_on_axis = [
-        other for other in led if component.statistic.is_switching and other.row == component.row
-    ]
-    return any(
-        other.evidence_nats >= component.evidence_nats
-        or _explained_share(component, other, state) > state.settings.majority_share
-        for other in others_on_axis
-    )
 
 
 def _explained_share(component: Component, other: Component, state: State) -> float:
@@ -230,9 +225,8 @@ def identify_switching(
 ) -> list[str]:
     """Return the keys of biases that switch within blocks and have no possible cause.
 
-    An axis has one of them: with it in the model, more switching does not explain powers and
-    tails that the first
-    has left, and may be a jump.
+    An axis has one of them: with it in the model, more switching does not explain powers and tails
+    that the first has left, and may be a jump.
     """
     return [
         key

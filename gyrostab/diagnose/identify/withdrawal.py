@@ -8,10 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gyrostab.diagnose.identify.components import (
-    split_layers,
-    sum_evidence,
-)
+from gyrostab.diagnose.identify.components import split_layers, sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import (
     Selection,

@@ -19,11 +19,7 @@ from gyrostab.diagnose.baseline.expected_statistics import line_columns, white_v
 from gyrostab.diagnose.evidence.sample_counts import kurtosis_moments
 from gyrostab.diagnose.evidence.spectral_lines import interpolate_bands
 from gyrostab.diagnose.evidence.wandering import expected_processes
-from gyrostab.diagnose.nulls.shared_noise import (
-    SharedNoise,
-    draw_shared_spectra,
-    find_shared_noise,
-)
+from gyrostab.diagnose.nulls.shared_noise import SharedNoise, draw_shared_spectra, find_shared_noise
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.diagnose.statistics.base import NullDraw
