@@ -40,7 +40,6 @@ _MIN_SPECTRUM_SHARE = 0.25  # of a block that must be present for its spectrum; 
 # Samples of a frame that was sent twice. In a block of 8000 samples of 2^16 equally likely values,
 # chance repeats as many in their order with a probability of 8000^2 / 2 / 2^48 = 1e-7.
 _MIN_RESENT = 3
-_MIN_GAP_S = 1.0  # shorter gaps are not listed; design choice
 _GRID_BLOCKS = 64  # blocks of which samples are kept for the quantization grid; limits memory
 _GRID_SAMPLES_PER_AXIS = 2**16  # limits memory
 
@@ -84,8 +83,8 @@ class Accumulator:
         self.line_counts = np.zeros((self.axes, RECORD_PARTS, 2))
         self.sines = SineSearch(self.axes, block_count, length, rate)
         self.kept_samples: list[Array] = []
-        self.gaps: list[tuple[int, int]] = []
-        self.gap_begin: int | None = None
+        self.gap_ends: list[int] = []  # samples from which on samples are lost, or there again
+        self.is_lost = False
         self.rotation = make_rotation_orders(log, length, rate)
         self.turn_line_sum = np.zeros((len(HARMONICS), kernel.ordinates(length)))
         self.turn_line_expected = np.zeros(kernel.ordinates(length))
@@ -119,7 +118,7 @@ class Accumulator:
             is_sent = present[row] & (values[row] != 0.0)
             bits = np.where(is_sent, values[row].view(np.int64), 0)
             kernel.resent_samples(bits, _MIN_RESENT, resent[row])
-        sub_blocks = [_sum_parts(axis_values, SUB_BLOCKS) for axis_values in values[:axes]]
+        sub_blocks = [_average_parts(axis_values, SUB_BLOCKS) for axis_values in values[:axes]]
         by_name: dict[str, NDArray[Any]] = {
             "moments": moments,
             "counts": counts,
@@ -127,14 +126,13 @@ class Accumulator:
             "histogram": histogram,
             "common_zeros": simultaneous_zeros(values[:axes]),
             "adjacent": np.count_nonzero(present[:axes, :, 1:] & present[:axes, :, :-1], axis=-1),
-            "sub_block_sum": np.stack([total for total, _ in sub_blocks]),
+            "sub_block_mean": np.stack([mean for mean, _ in sub_blocks]),
             "sub_block_samples": np.stack([number for _, number in sub_blocks]),
             **self._measure_spectra(block_range, centred, present),
         }
         for name in self.lagged:
-            total, number = _sum_parts(values[axes + self.channels.index(name)], CHANNEL_PARTS)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                by_name[f"parts_{name}"] = (total / number)[None]
+            channel = values[axes + self.channels.index(name)]
+            by_name[f"parts_{name}"] = _average_parts(channel, CHANNEL_PARTS)[0][None]
         self.sines.add(values[:axes].reshape(axes, -1))
         for kind, at_once in simultaneous_samples(present[:axes]).items():
             of_kind = self.at_once.setdefault(kind, np.zeros(self.block_count, np.int64))
@@ -163,8 +161,10 @@ class Accumulator:
                     centred[row], present[row], values[self.ramp], *self.ramp_range,
                     sums[row], numbers[row],
                 )  # fmt: skip
+            with np.errstate(invalid="ignore"):
+                profile_mean = sums / numbers
             by_name |= {
-                "profile_sum": sums,
+                "profile": profile_mean,
                 "profile_samples": numbers,
                 "ramp_turns": self._measure_ramp_turns(values[self.ramp])[None],
             }
@@ -330,24 +330,20 @@ class Accumulator:
         return cross * np.sqrt(scale), shape
 
     def _find_gaps(self, block_range: slice, present: NDArray[np.bool_]) -> None:
-        """List the long gaps, in which no axis has a sample."""
-        lost = np.concatenate([[self.gap_begin is not None], ~present.any(axis=0).ravel()])
-        first = block_range.start * self.length
-        for place in np.flatnonzero(lost[1:] != lost[:-1]) if lost.any() else ():
-            if lost[place + 1]:
-                self.gap_begin = first + int(place)
-            else:
-                begin = self.gap_begin if self.gap_begin is not None else first
-                if first + place - begin >= _MIN_GAP_S * self.rate:
-                    self.gaps.append((begin, first + int(place)))
-                self.gap_begin = None
+        """List the ends of the gaps, in which no axis has a sample."""
+        lost = ~present.any(axis=0).ravel()
+        changes = np.flatnonzero(np.diff(lost, prepend=self.is_lost))
+        self.gap_ends += (block_range.start * self.length + changes).tolist()
+        self.is_lost = bool(lost[-1])
 
 
-def _sum_parts(values: Array, parts: int) -> tuple[Array, Array]:
-    """Return sums and numbers of the samples in equal parts of the blocks (block, sample)."""
+def _average_parts(values: Array, parts: int) -> tuple[Array, NDArray[np.int64]]:
+    """Return means and numbers of the samples in equal parts of the blocks (block, sample)."""
     edges, present = np.arange(parts) * values.shape[1] // parts, ~np.isnan(values)
     total = np.add.reduceat(np.where(present, values, 0.0), edges, axis=1)
-    return total, np.add.reduceat(present, edges, axis=1, dtype=np.float64)
+    number = np.add.reduceat(present, edges, axis=1, dtype=np.int64)
+    with np.errstate(invalid="ignore"):
+        return total / number, number
 
 
 def _subtract_mean(values: Array, present: NDArray[np.bool_]) -> Array:

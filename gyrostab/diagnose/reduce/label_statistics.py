@@ -29,6 +29,11 @@ Array = NDArray[np.float64]
 _MAX_SMOOTHING_BLOCKS = 2.0  # longest time scale of the smoothing of a channel; design choice
 _STEP_VALUES_PER_BLOCK = 256  # values from which the quantization step is found; limits time
 MIN_MEAN_SHARE = 0.1  # of a block that must be present for its mean; design choice
+_MIN_GAP_S = 1.0  # shorter gaps are not listed; design choice
+_AS_MEASURED = (
+    "shape", "neighbours", "adjacent", "sub_block_mean", "sub_block_samples", "order",
+    "order_level", "turn_mean", "turn_power", "profile", "profile_samples",
+)  # fmt: skip
 
 
 def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Dataset:
@@ -75,12 +80,9 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         "variance": np.where(enough, moments[..., 1], np.nan),
         "samples": present,
         "power": by_name["power"][axes],
-        "shape": by_name["shape"],
-        "neighbours": by_name["neighbours"],
         "kurtosis": np.where(np.isnan(by_name["neighbours"]), np.nan, kurtosis),
         "peaks": peaks,
         "outliers": outliers,
-        "adjacent": by_name["adjacent"],
         "repeats": repeats + resent[..., 0],
         "repeat_runs": counts[..., 7] + resent[..., 1],
         "resent": resent[..., 0],
@@ -102,11 +104,11 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         "zone_width": zones[:, 0],
         "zone_width_stderr": zones[:, 1],
     }
-    arrays |= work.sines.strongest(_line_frequencies(work)) | _sub_block_means(by_name)
+    arrays |= {name: by_name[name] for name in _AS_MEASURED if name in by_name}
     if work.rotation is not None:
         with np.errstate(invalid="ignore", divide="ignore"):
             arrays["turn_line_power"] = work.turn_line_sum / (work.turn_line_expected * work.rate)
-    arrays |= _phase_locked_statistics(by_name) | _gap_table(work, log, restart)
+    arrays |= work.sines.strongest(_line_frequencies(work)) | _gap_table(work, log, restart)
     variables = (
         label_variables(arrays)
         | _cross_spectra(work, by_name, log)
@@ -114,6 +116,7 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         | _channel_part_means(work, by_name, log)
     )
     if work.ramp is not None:
+        variables |= label_variables({"ramp_turns": by_name["ramp_turns"][0]})
         variables["ramp_turns"][2].update(zip(("low", "high"), work.ramp_range, strict=True))
     return xr.Dataset(
         variables, coords=_make_coordinates(work, log), attrs=_make_attributes(work, log, present)
@@ -123,14 +126,6 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
 def _kept_values(work: Accumulator, row: int, max_per_block: int | None = None) -> Array:
     """Return the kept samples of an axis, up to `max_per_block` of each block."""
     return np.concatenate([samples[row][:max_per_block] for samples in work.kept_samples])
-
-
-def _sub_block_means(by_name: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return means over sub-blocks, which show a bias that switches within blocks."""
-    count = by_name["sub_block_samples"]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = by_name["sub_block_sum"] / count
-    return {"sub_block_mean": mean, "sub_block_samples": count.astype(np.int64)}
 
 
 def _equal_block_share(
@@ -198,18 +193,6 @@ def _cross_spectra(
     return variables
 
 
-def _phase_locked_statistics(by_name: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return what is locked to the tool rotation and to the ramp phase."""
-    names = ("order", "order_level", "turn_mean", "turn_power")
-    arrays: dict[str, Any] = {name: by_name[name] for name in names if name in by_name}
-    if "profile_sum" in by_name:
-        samples = by_name["profile_samples"]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            arrays["profile"] = by_name["profile_sum"] / samples
-        arrays |= {"profile_samples": samples, "ramp_turns": by_name["ramp_turns"][0]}
-    return arrays
-
-
 def _channel_means(
     work: Accumulator, by_name: Mapping[str, NDArray[Any]], log: xr.Dataset
 ) -> dict[str, Any]:
@@ -273,7 +256,9 @@ def _channel_part_means(
 
 def _gap_table(work: Accumulator, log: xr.Dataset, restart: float) -> dict[str, Any]:
     """Return gaps, and those after which the tool restarted, in seconds since the start."""
-    gaps = np.array(work.gaps, dtype=np.float64).reshape(-1, 2) / work.rate
+    complete = work.gap_ends[: len(work.gap_ends) // 2 * 2]  # not that at the end of the record
+    gaps = np.array(complete, dtype=np.float64).reshape(-1, 2)
+    gaps = gaps[np.diff(gaps)[:, 0] >= _MIN_GAP_S * work.rate] / work.rate
     starts = gaps[gaps[:, 1] - gaps[:, 0] >= restart].tolist()
     if "gap_cause" in log.variables:
         is_restart = log["gap_cause"].values == GAP_CAUSES.index("restart")
