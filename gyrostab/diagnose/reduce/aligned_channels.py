@@ -258,15 +258,7 @@ def _place_on_grid(log: xr.Dataset, name: str, clock: _Clock, reach: float, choo
 
 def _take_nearest(instants: Stamps, stamps: Stamps, values: Array, reach: float) -> Array:
     """Return the nearest value of each instant, NaN beyond reach."""
-    following = (
-        np.clip(np.searchsorted(stamps, instants), 1, stamps.size - 1)
-        if stamps.size > 1
-        else np.zeros(instants.size, np.int64)
-    )
-    preceding = np.maximum(following - 1, 0)
-    place = np.where(
-        instants - stamps[preceding] <= stamps[following] - instants, preceding, following
-    )
+    place = np.searchsorted(stamps[1:] + stamps[:-1], 2 * instants)
     return np.where(np.abs(instants - stamps[place]) <= reach, values[place], np.nan)
 
 
