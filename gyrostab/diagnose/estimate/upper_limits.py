@@ -7,10 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import brentq
-from scipy.special import ndtr, ndtri
 
+from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.predict.average_sizes import plain_places
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
@@ -20,9 +18,8 @@ from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import effects
 
-CONFIDENCE = 0.95
+BEYOND = 0.05  # probability of a larger size
 MAX_VARIANTS = 9  # evenly spread over the grid of a mean: enough for a smooth mixture
-ONE_SIDED_SIGMA = float(ndtri(CONFIDENCE))  # quantile of the normal law
 
 
 def find_upper_limits(identifications: Identifications) -> dict[str, dict[str, Any]]:
@@ -125,35 +122,9 @@ def _limit_row(component: Component, family: Sequence[Variant], state: State) ->
     evidence = np.array([mixture.evidence for mixture in mixtures])[is_usable] - np.log(sd)
     if not np.isfinite(evidence).any():
         return math.nan
-    share = np.exp(evidence - np.logaddexp.reduce(evidence))
     one_sided = (
         component.variant.squared and component.statistic.is_power
     )  # the product of two axes may have either sign
     size = np.maximum(mean, 0.0) if one_sided else np.abs(mean)
-    return mixture_limit(size, sd, share)
-
-
-def mixture_limit(
-    size: NDArray[np.float64], sd: NDArray[np.float64], share: NDArray[np.float64]
-) -> float:
-    """Find the value that a mixture of normal laws is below with a probability of 95 %.
-
-    Parameters
-    ----------
-    size, sd, share : ndarray, shape (law,)
-        Mean, standard deviation and weight of each law.
-
-    Examples
-    --------
-    >>> round(mixture_limit(np.array([1.0]), np.array([0.1]), np.array([1.0])), 3)
-    1.164
-    """
-
-    def excess(bound: float) -> float:
-        return float(share @ ndtr((bound - size) / sd)) - CONFIDENCE
-
-    ends = size + ONE_SIDED_SIGMA * sd
-    low, high = float(ends.min()), float(ends.max())
-    if excess(low) >= 0.0:  # rounding: one law has all the weight, or all have the same limit
-        return low
-    return high if excess(high) <= 0.0 else float(brentq(excess, low, high))
+    joined = Mixture(evidence, size[:, None], np.square(sd)[:, None, None])
+    return float(joined.quantiles(BEYOND)[1, 0])

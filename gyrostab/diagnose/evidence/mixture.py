@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from gyrostab.diagnose.evidence.products import Products
 
@@ -43,12 +43,12 @@ class Mixture:
         """
         weight = self.weights()[:, None]
         sd = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
-        reach = 40.0 * sd.max(axis=0)
-        low, high = self.mean.min(axis=0) - reach, self.mean.max(axis=0) + reach
+        sd = np.where(np.isfinite(sd).all(axis=0), sd, np.nan)
         ends = []
         for share in (tail, 1.0 - tail):
-            below, above = low.copy(), high.copy()
-            with np.errstate(invalid="ignore"):  # infinite errors
+            of_points = self.mean + float(ndtri(share)) * sd
+            below, above = of_points.min(axis=0), of_points.max(axis=0)
+            with np.errstate(invalid="ignore"):  # errors of 0, or unknown
                 for _ in range(80):
                     middle = 0.5 * (below + above)
                     is_low = (weight * ndtr((middle - self.mean) / sd)).sum(axis=0) < share

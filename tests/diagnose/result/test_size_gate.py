@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 import gyrostab
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted, fit_identifications
-from gyrostab.diagnose.estimate.upper_limits import mixture_limit
+from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on
@@ -254,7 +254,8 @@ def test_explained_requires_evidence(evidence_nats, forecast, before, after, lef
 def test_limit_of_a_mixture_lies_between_its_laws(laws):
     size, sd, share = np.array(laws).T
     ends = size + 1.6448536269514722 * sd
-    limit = mixture_limit(size, sd, share / share.sum())
+    mixture = Mixture(np.log(share), size[:, None], np.square(sd)[:, None, None])
+    limit = mixture.quantiles(0.05)[1, 0]
     assert ends.min() * (1.0 - 1e-9) <= limit <= ends.max() * (1.0 + 1e-9)
 
 
