@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby, pairwise
+from itertools import pairwise
 
 import numpy as np
 
@@ -39,8 +39,7 @@ class Point:
     sizes: Mixture
     share: float = 1.0  # length of the part of the grid that it represents, in steps
     unlikely: float = 0.0  # prior penalty [nats]
-    line: int = 0  # of the grid, that it is on
-    place: float = 0.0  # along that line, in steps
+    place: float = 0.0  # along its line of the grid, in steps
 
     @property
     def evidence(self) -> float:
@@ -54,7 +53,7 @@ class Point:
         )
 
 
-def _make_point(variant: Variant, sizes: Mixture, line: int, place: float) -> Point:
+def _make_point(variant: Variant, sizes: Mixture, place: float) -> Point:
     """Return a point with a prior that is uniform in size over standard error.
 
     The same size is another effect where a time constant is longer. With a prior uniform in size,
@@ -62,7 +61,7 @@ def _make_point(variant: Variant, sizes: Mixture, line: int, place: float) -> Po
     """
     mean = np.einsum("g,gij->ij", sizes.weights(), sizes.covariance)
     unlikely = 0.5 * float(np.linalg.slogdet(mean)[1])
-    return Point(variant, sizes, unlikely=unlikely, line=line, place=place)
+    return Point(variant, sizes, unlikely=unlikely, place=place)
 
 
 def refine_grid(component: Component, state: State, points: Sequence[Point]) -> list[Point]:
@@ -72,90 +71,127 @@ def refine_grid(component: Component, state: State, points: Sequence[Point]) -> 
     best point, and again while its ends are likely and differ, so that the likelihood is smooth
     from point to point. Points within a step share its weight.
     """
-    name = _find_scale(component, points)
-    if name is None:
+    scale = _find_scale(component, points)
+    if scale is None:
         return list(points)
-    grid = [
-        _make_point(point.variant, point.sizes, *place)
-        for point, place in zip(points, _place_points(points, name), strict=True)
-    ]
-    for members in _split_lines(grid):
-        for down in (True, False) if len(members) > 1 else ():
-            grid += _extend_line(component, state, name, members, grid, down)
+    grid = _Grid(component, state, *scale, points)
+    for line in grid.lines:
+        for down in (True, False) if len(line) > 1 else ():
+            grid.extend_line(line, down)
     for _ in range(MAX_ROUNDS):
-        room = max(MAX_ADDED_POINTS - len(grid) + len(points), 0)
-        halved = [
-            _halve_step(component, state, name, left, right)
-            for left, right in _steps_to_halve(grid)[:room]
-        ]
-        new = [point for point in halved if point is not None]
-        if not new:
+        if not grid.halve_steps(max(MAX_ADDED_POINTS - len(grid.points) + len(points), 0)):
             break
-        grid += new
-    return _share_steps(grid)
+    return [point for line in grid.lines for point in _share_steps(line)]
 
 
-def _find_scale(component: Component, points: Sequence[Point]) -> str | None:
-    """Return the first parameter of the grid that is a scale and has several values."""
+def _find_scale(component: Component, points: Sequence[Point]) -> tuple[str, str] | None:
+    """Return the first parameter of the grid that is a scale of several values, and its unit."""
     if not component.statistic.is_linear_in_means:
         return None
+    parameters = effects()[component.candidate.effect].parameters()
+    units = {item.name: item.unit for item in parameters}
     for name in points[0].variant.values:
         values = {point.variant.values.get(name) for point in points}
-        if len(values) > 2 and _unit_of(component, name) in _SCALES and name != _INSTANT:
-            return name
+        if len(values) > 2 and units.get(name) in _SCALES and name != _INSTANT:
+            return name, units[name]
     return None
 
 
-def _unit_of(component: Component, name: str) -> str:
-    return next(
-        (
-            item.unit
-            for item in effects()[component.candidate.effect].parameters()
-            if item.name == name
-        ),
-        "",
-    )
+class _Grid:
+    """Points in lines along which one parameter changes, each line in order."""
 
+    def __init__(
+        self, component: Component, state: State, name: str, unit: str, points: Sequence[Point]
+    ):
+        self.component, self.state, self.name, self.unit = component, state, name, unit
+        lines: dict[tuple[object, ...], list[Point]] = {}
+        for point in points:
+            others = tuple(value for key, value in point.variant.values.items() if key != name)
+            lines.setdefault(others, []).append(point)
+        self.lines = [
+            [
+                _make_point(point.variant, point.sizes, place)
+                for place, point in enumerate(sorted(line, key=self.value_at))
+            ]
+            for line in lines.values()
+        ]
 
-def _place_points(points: Sequence[Point], name: str) -> list[tuple[int, float]]:
-    """Return line (of the same other values) and place of every point."""
-    lines: dict[tuple[object, ...], list[int]] = {}
-    for number, point in enumerate(points):
-        lines.setdefault(
-            tuple(value for key, value in point.variant.values.items() if key != name), []
-        ).append(number)
-    out: dict[int, tuple[int, float]] = {}
-    for line, members in enumerate(lines.values()):
-        ordered = sorted(members, key=lambda number: _value_at(points[number], name))
-        out |= {number: (line, float(place)) for place, number in enumerate(ordered)}
-    return [out[number] for number in range(len(points))]
+    @property
+    def points(self) -> list[Point]:
+        """All points."""
+        return [point for line in self.lines for point in line]
 
+    def value_at(self, point: Point) -> float:
+        """Return the value of the parameter that changes along the lines."""
+        return float(point.variant.values[self.name])
 
-def _value_at(point: Point, name: str) -> float:
-    return float(point.variant.values[name])
+    def find_best(self) -> Point:
+        """Return the likeliest point."""
+        return max(self.points, key=lambda point: point.evidence)
 
+    def halve_steps(self, most: int) -> bool:
+        """Halve the steps that need it, the likeliest first; return whether there are any."""
+        best = self.find_best()
+        is_first = not any(point.place % 1.0 for point in self.points)
+        steps = [
+            (line, left, right)
+            for line in self.lines
+            for left, right in pairwise(line)
+            if (is_first and (best is left or best is right))
+            or (
+                max(left.evidence, right.evidence) > best.evidence - LIKELY_NATS
+                and _are_different(left, right)
+            )
+        ]
+        steps.sort(key=lambda step: -max(point.evidence for point in step[1:]))
+        added = []
+        for line, left, right in steps[:most]:
+            low, high = sorted(map(self.value_at, (left, right)))
+            # in the logarithm unless one end is near zero
+            middle = math.sqrt(low * high) if low > high / MAX_RATIO else 0.5 * (low + high)
+            added.append(self._add_point(line, left, middle, 0.5 * (left.place + right.place)))
+        return any(point is not None for point in added)
 
-def _split_lines(grid: Sequence[Point]) -> list[list[Point]]:
-    """Return the points of each line in order."""
-    ordered = sorted(grid, key=lambda point: (point.line, point.place))
-    return [list(line) for _, line in groupby(ordered, key=lambda point: point.line)]
+    def extend_line(self, line: list[Point], down: bool) -> None:
+        """Add points beyond an end of a line, in steps like the last one.
 
+        They continue while the likelihood rises and is within `LIKELY_NATS` of the largest. A lag
+        longer than the record is only another slope.
+        """
+        previous, last = (line[1], line[0]) if down else (line[-2], line[-1])
+        ratio = self.value_at(last) / max(self.value_at(previous), 1e-300)
+        top = self.find_best().evidence - LIKELY_NATS
+        longest = float(self.state.blocks["end"].values[-1]) / _SECONDS.get(self.unit, math.nan)
+        for _ in range(MAX_ROUNDS if 1.0 / MAX_RATIO < ratio < MAX_RATIO else 0):
+            value = ratio * self.value_at(last)
+            is_rising = last.evidence > max(previous.evidence + STEEP_NATS, top)
+            if not is_rising or value > longest:
+                break
+            added = self._add_point(line, last, value, last.place + (-1.0 if down else 1.0))
+            if added is None:
+                break
+            previous, last = last, added
 
-def _steps_to_halve(grid: Sequence[Point]) -> list[tuple[Point, Point]]:
-    """Return the steps to be halved, the likeliest first."""
-    best = max(grid, key=lambda point: point.evidence)
-    first = not any(point.place % 1.0 for point in grid)
-    out = [
-        (left, right)
-        for line in _split_lines(grid)
-        for left, right in pairwise(line)
-        if (first and (best is left or best is right))
-        or (
-            max(left.evidence, right.evidence) > best.evidence - LIKELY_NATS
-            and _are_different(left, right)
-        )
-    ]
-    return sorted(out, key=lambda pair: -max(point.evidence for point in pair))
+    def _add_point(
+        self, line: list[Point], like: Point, value: float, place: float
+    ) -> Point | None:
+        """Add a point of another value to a line; None where the effect cannot have it."""
+        sought = replace(like.variant, values={**like.variant.values, self.name: value})
+        try:
+            variant = rebuild_variant(
+                self.component.candidate,
+                sought,
+                self.state.blocks,
+                self.state.baseline["coefficient"],
+            )
+        except OptionError:
+            return None
+        if variant is None or variant.values.get(self.name) != value:
+            return None
+        added = _make_point(variant, component_mixture(self.component, self.state, variant), place)
+        line.append(added)
+        line.sort(key=lambda point: point.place)
+        return added
 
 
 def _are_different(left: Point, right: Point) -> bool:
@@ -167,75 +203,11 @@ def _are_different(left: Point, right: Point) -> bool:
     )
 
 
-def _halve_step(
-    component: Component, state: State, name: str, left: Point, right: Point
-) -> Point | None:
-    """Return the point in the middle of a step, in the logarithm unless one end is near zero."""
-    low, high = sorted((_value_at(left, name), _value_at(right, name)))
-    value = math.sqrt(low * high) if low > high / MAX_RATIO else 0.5 * (low + high)
-    return _add_point(component, state, name, left, value, 0.5 * (left.place + right.place))
-
-
-def _extend_line(
-    component: Component,
-    state: State,
-    name: str,
-    line: Sequence[Point],
-    grid: Sequence[Point],
-    down: bool,
-) -> list[Point]:
-    """Return points beyond an end of a line, in steps like the last one.
-
-    They continue while the likelihood rises and is within `LIKELY_NATS` of the largest. A lag
-    longer than the record is only another slope.
-    """
-    previous, last = (line[1], line[0]) if down else (line[-2], line[-1])
-    ratio = _value_at(last, name) / max(_value_at(previous, name), 1e-300)
-    top = max(point.evidence for point in grid) - LIKELY_NATS
-    unit = _SECONDS.get(_unit_of(component, name), math.nan)
-    longest = float(state.blocks["end"].values[-1]) / unit
-    out: list[Point] = []
-    while (
-        len(out) < MAX_ROUNDS
-        and 1.0 / MAX_RATIO < ratio < MAX_RATIO
-        and last.evidence > max(previous.evidence + STEEP_NATS, top)
-    ):
-        value = ratio * _value_at(last, name)
-        if value > longest:
-            break
-        place = last.place + (-1.0 if down else 1.0)
-        added = _add_point(component, state, name, last, value, place)
-        if added is None:
-            break
-        out.append(added)
-        previous, last = last, added
-    return out
-
-
-def _add_point(
-    component: Component, state: State, name: str, like: Point, value: float, place: float
-) -> Point | None:
-    """Return a point of another value on the same line, or None where the effect cannot have it."""
-    sought = replace(like.variant, values={**like.variant.values, name: value})
-    try:
-        variant = rebuild_variant(
-            component.candidate, sought, state.blocks, state.baseline["coefficient"]
-        )
-    except OptionError:
-        return None
-    if variant is None or variant.values.get(name) != value:
-        return None
-    return _make_point(variant, component_mixture(component, state, variant), like.line, place)
-
-
-def _share_steps(grid: Sequence[Point]) -> list[Point]:
-    """Return the points with their shares: half of both steps next to them, or half a step."""
-    out = []
-    for line in _split_lines(grid):
-        place = np.array([point.place for point in line])
-        edge = np.concatenate([[place[0] - 0.5], 0.5 * (place[1:] + place[:-1]), [place[-1] + 0.5]])
-        out += [
-            replace(point, share=float(share))
-            for point, share in zip(line, np.diff(edge), strict=True)
-        ]
-    return out
+def _share_steps(line: Sequence[Point]) -> list[Point]:
+    """Return points with their shares: half of both steps next to them, or half a step."""
+    place = np.array([point.place for point in line])
+    edge = np.concatenate([[place[0] - 0.5], 0.5 * (place[1:] + place[:-1]), [place[-1] + 0.5]])
+    return [
+        replace(point, share=share)
+        for point, share in zip(line, np.diff(edge).tolist(), strict=True)
+    ]
