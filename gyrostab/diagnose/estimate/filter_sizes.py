@@ -14,10 +14,20 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     common_variance,
     separate_share,
 )
-from gyrostab.diagnose.baseline.posterior import Fit, choose_filter, fit_behind
+from gyrostab.diagnose.baseline.posterior import (
+    Fit,
+    average_blocks,
+    choose_filter,
+    fit_behind,
+)
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.filter_response import band_response
-from gyrostab.diagnose.predict.linear_model import State, unspread_share
+from gyrostab.diagnose.predict.linear_model import (
+    State,
+    band_widths,
+    stack_columns,
+    unspread_share,
+)
 from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.registry import effects
@@ -168,34 +178,22 @@ def _average_powers(axis: str, state: State) -> tuple[Fit, Array]:
 
     The second result is how gaps mix the bands of the noise.
     """
-    blocks = state.blocks
-    row = state.axes.index(axis)
+    blocks, row = state.blocks, state.axes.index(axis)
     power, shape = (blocks[name].values[row] for name in ("power", "shape"))
-    use = np.where(
-        np.isfinite(power) & np.isfinite(shape) & ~state.masked[row][:, None], shape, 0.0
-    )
-    total = np.maximum(use.sum(axis=0), 1e-300)
     common, shape_alone = (values[row] for values in common_variance(blocks))
-    share = separate_share(shape, shape_alone, common)
-
-    def mean(values: Array) -> Array:
-        return np.asarray(
-            (use * np.nan_to_num(np.broadcast_to(values, use.shape))).sum(axis=0) / total
-        )
-
-    unspread = mean(unspread_share(blocks)[row, :, None])
-    width = (blocks["band_high"] - blocks["band_low"]).values
-    mixing = np.diag(unspread) + np.outer(1.0 - unspread, width / width.sum())
-    effect_columns = [mean(column) for column in state.given.get(("power", axis), [])]
-    free = (
-        np.stack([column / max(np.abs(column).max(), 1e-300) for column in effect_columns], axis=1)
-        if effect_columns
-        else None
+    effects_of_axis = state.given.get(("power", axis), [])
+    columns = [unspread_share(blocks)[row, :, None], state.weight[row], *effects_of_axis]
+    averaged = average_blocks(
+        power,
+        np.where(state.masked[row][:, None], np.nan, shape),
+        np.nan_to_num(stack_columns(columns, shape.shape)),
     )
-    return Fit(
-        mean(power),
-        mixing @ band_columns(blocks),
-        total * share,
-        free_columns=free,
-        start=mean(state.weight[row]),
+    unspread, start, free = np.split(averaged.columns, [1, 2], axis=1)
+    width = band_widths(blocks)
+    mixing = np.diag(unspread[:, 0]) + (1.0 - unspread) * (width / width.sum())
+    return averaged._replace(
+        columns=mixing @ band_columns(blocks),
+        weight=averaged.weight * separate_share(shape, shape_alone, common),
+        free_columns=free / np.maximum(np.abs(free).max(axis=0), 1e-300),
+        start=start[:, 0],
     ), mixing

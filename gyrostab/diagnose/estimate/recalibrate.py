@@ -276,12 +276,7 @@ def _fit_noise(
     reduced = shape * share[:, None]
     fit = _average_groups(power, reduced, columns, state.weight[row], axis_effects, chosen)
     square, information, _ = fit_squares(fit)
-    plain = float(
-        (
-            (fit.weight / (fit.start if fit.start is not None else fit.power) ** 2)
-            * fit.columns[:, 1] ** 2
-        ).sum()
-    )
+    plain = float((fit.weight / np.square(fit.start) * fit.columns[:, 1] ** 2).sum())
     if not information[1, 1] > state.settings.min_information_share * plain or not square[1] > 0.0:
         return None
     square = np.maximum(square, [0.0, floor_square(fit), 0.0, 0.0])
