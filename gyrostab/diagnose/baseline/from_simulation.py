@@ -12,6 +12,7 @@ from scipy.special import chdtrc
 from gyrostab.diagnose.baseline.calibrate import MIN_BANDS, assemble_baseline, calibrate_axes
 from gyrostab.diagnose.baseline.expected_statistics import noise_powers, sum_noise
 from gyrostab.diagnose.baseline.from_model import scale_to_quiescent
+from gyrostab.diagnose.baseline.known_lines import average_in_bands
 from gyrostab.diagnose.baseline.posterior import Posterior
 from gyrostab.diagnose.baseline.quiescent import (
     find_quiescent_blocks,
@@ -20,11 +21,12 @@ from gyrostab.diagnose.baseline.quiescent import (
     noise_level_excess,
 )
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_evidence, line_skirt
-from gyrostab.diagnose.predict.linear_model import band_widths, unspread_share
+from gyrostab.diagnose.predict.linear_model import unspread_share
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables, weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import local_level
+from gyrostab.kernels.spectra.periodogram import band_edges
 
 Array = NDArray[np.float64]
 _MAX_LINES = 100  # on an axis; limits time
@@ -133,8 +135,6 @@ def _shared_statistics(
 
     `expected` is the power of the simulation (axis, block, band), `spectrum` that of the baseline.
     """
-    if "cross" not in simulated:
-        return {}
     cross, shape = (simulated[name].values for name in ("cross", "cross_shape"))
     first, second = pair_indices(simulated)
     coherency, coherency_shape = weighted_mean(
@@ -175,9 +175,11 @@ def _line_statistics(
     )
     evidence_nats = line_evidence(power[None], weight, slope)[0]
     lines, largest, peaks = (np.zeros(evidence_nats.shape) for _ in range(3))
-    inside, near_unexplained = _lines_in_bands(simulated), unexplained.copy()
+    near_unexplained = unexplained.copy()
     near_unexplained[:, 1:] |= unexplained[:, :-1]
     near_unexplained[:, :-1] |= unexplained[:, 1:]
+    lines_per_band = np.diff(band_edges(int(simulated.attrs["block_samples"])))
+    near_unexplained = np.repeat(near_unexplained, lines_per_band, axis=1)
     for row, axis in enumerate(simulated["axis"].values):
         in_skirt = np.zeros(evidence_nats.shape[1], np.bool_)
         for _ in range(_MAX_LINES):
@@ -191,37 +193,26 @@ def _line_statistics(
         mean = np.average(power[row][good], axis=0, weights=weight[row][good])
         level = np.where(in_skirt, local_level(mean[None])[0], mean)
         lines[row] = np.maximum(mean - level, 0.0)
-        if "sine_nats" in simulated:
-            weak = (simulated["sine_nats"].values[row] > settings.line_nats) & ~in_skirt
-            square, stderr = (
-                simulated[f"sine_square{end}"].values[row] / (4.0 * frequency[0])
-                for end in ("", "_stderr")
-            )
-            lines[row] = np.where(weak, square, lines[row])
-            largest[row] = np.where(weak, square + settings.clear_sigma * stderr, 0.0)
+        weak = (simulated["sine_nats"].values[row] > settings.line_nats) & ~in_skirt
+        square, stderr = (
+            simulated[f"sine_square{end}"].values[row] / (4.0 * frequency[0])
+            for end in ("", "_stderr")
+        )
+        lines[row] = np.where(weak, square, lines[row])
+        largest[row] = np.where(weak, square + settings.clear_sigma * stderr, 0.0)
         largest[row] = np.maximum(largest[row], lines[row])
         smooth = np.convolve(
             np.pad(level, _SMOOTHING_LINES // 2, mode="edge"),
             np.full(_SMOOTHING_LINES, 1.0 / _SMOOTHING_LINES),
             "valid",
         )
-        peaks[row] = np.where(inside[near_unexplained[row]].any(axis=0), smooth - slope[row], 0.0)
+        peaks[row] = np.where(near_unexplained[row], smooth - slope[row], 0.0)
     if not (lines.any() or peaks.any()):
         return {}
-    in_bands = (lines + peaks) @ _lines_in_bands(blocks).T
-    line_power = in_bands * blocks["line_frequency"].values[0] / band_widths(blocks)
+    in_bands = average_in_bands(lines + peaks, blocks)
     return {
         "lines": lines,
         "lines_most": largest,
         "peaks": peaks,
-        "line_spectrum": line_power * unspread_share(blocks).mean(axis=1)[:, None],
+        "line_spectrum": in_bands * unspread_share(blocks).mean(axis=1)[:, None],
     }
-
-
-def _lines_in_bands(blocks: xr.Dataset) -> NDArray[np.bool_]:
-    """Return whether a line is in a band, (band, line)."""
-    frequency = blocks["line_frequency"].values
-    return np.asarray(
-        (frequency >= blocks["band_low"].values[:, None])
-        & (frequency < blocks["band_high"].values[:, None])
-    )

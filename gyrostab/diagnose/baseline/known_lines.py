@@ -84,7 +84,7 @@ def resonance_density(
 
     Its peak may be narrower than the width of the taper.
     """
-    if not math.isfinite(getattr(effect, "quality", math.inf)) or "line_frequency" not in blocks:
+    if not math.isfinite(getattr(effect, "quality", math.inf)):
         return None
     frequency = blocks["line_frequency"].values
     fine = _between_lines(frequency)
@@ -196,18 +196,18 @@ def remove_known_lines(
     exceeds = _take_leakage(exceeds).any(axis=-1)
     freed = noise + np.where(exceeds | (largest_power < error * noise), above, 0.0)
     freed = np.where(known_power > 0.0, np.maximum(freed, 0.0), power.values)
-    out = {"line_power": power.copy(data=np.where(np.isfinite(power.values), freed, np.nan))}
-    if "sine_nats" in blocks:
-        square, stderr = (blocks[f"sine_square{end}"].values for end in ("", "_stderr"))
-        step = float(blocks["line_frequency"][0])
-        known_square, largest_square = (
-            4.0 * step * _take_leakage(lines[:, 0]).sum(axis=-1)
-            for lines in (known_power, largest_power)
-        )
-        exceeds = square - largest_square > error * largest_square + settings.clear_sigma * stderr
-        peaks = _take_leakage(baseline["peaks"].values).sum(axis=-1)
-        in_peak = peaks > error * noise[:, 0]
-        new = (exceeds | (largest_square == 0.0)) & ~in_peak
-        out["sine_nats"] = blocks["sine_nats"].where(new, -np.inf)
-        out["sine_square"] = blocks["sine_square"] - known_square
-    return blocks.assign(out)
+    square, stderr = (blocks[f"sine_square{end}"].values for end in ("", "_stderr"))
+    step = float(blocks["line_frequency"][0])
+    known_square, largest_square = (
+        4.0 * step * _take_leakage(lines[:, 0]).sum(axis=-1)
+        for lines in (known_power, largest_power)
+    )
+    exceeds = square - largest_square > error * largest_square + settings.clear_sigma * stderr
+    peaks = _take_leakage(baseline["peaks"].values).sum(axis=-1)
+    in_peak = peaks > error * noise[:, 0]
+    new = (exceeds | (largest_square == 0.0)) & ~in_peak
+    return blocks.assign(
+        line_power=power.copy(data=np.where(np.isfinite(power.values), freed, np.nan)),
+        sine_nats=blocks["sine_nats"].where(new, -np.inf),
+        sine_square=blocks["sine_square"] - known_square,
+    )

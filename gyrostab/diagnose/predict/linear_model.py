@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.held_out import LinearModel
 from gyrostab.diagnose.predict.candidates import Candidate, content_digest
-from gyrostab.diagnose.reduce.block_statistics import measured
+from gyrostab.diagnose.reduce.block_statistics import measured, pair_indices
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.periodogram import taper
 
@@ -149,11 +149,9 @@ def moves_within_blocks(
 
 def cross_without(blocks: xr.Dataset, left_out: NDArray[np.bool_]) -> xr.DataArray:
     """Return cross-spectra of the pairs without blocks that are left out (axis, block)."""
-    axes = [str(axis) for axis in blocks["axis"].values]
-    pairs = np.array(
-        [[axes.index(axis) for axis in pair] for pair in pair_rows(blocks)], np.int64
-    ).reshape(-1, 2)
-    return blocks["cross"].where(~xr.DataArray(left_out[pairs].any(axis=1), dims=("pair", "block")))
+    first, second = pair_indices(blocks)
+    without = xr.DataArray(left_out[first] | left_out[second], dims=("pair", "block"))
+    return blocks["cross"].where(~without)
 
 
 def records_last(values: Array, plain: int) -> Array:

@@ -143,8 +143,6 @@ def sticking_value(values: Array, step: float) -> tuple[float, float]:
 
 def sticking_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
     """Find the axes (axis,) that stick at a value other than 0; see `sticking_value`."""
-    if "zone_centre" not in blocks:
-        return np.zeros(blocks.sizes["axis"], np.bool_)
     return np.asarray(np.isfinite(blocks["zone_centre"].values))
 
 
