@@ -63,13 +63,14 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
     """
     axes = [str(axis) for axis in blocks["axis"].values]
     shape = (len(axes), blocks.sizes["block"], blocks.sizes["band"])
-    mean, random = np.zeros(shape[:2]), _RandomMeans(shape)
+    mean = np.zeros(shape[:2])
     left = np.ones(shape[:2])  # share of the noise
     squares = np.repeat(square[:, None], shape[1], axis=1)
     # factors of filters on the noise terms, (axis, band, term)
     added, response = np.zeros(shape), np.ones((shape[0], shape[2], len(NOISE)))
     narrow: list[tuple[Effect, list[int], Array]] = []
     coherent: list[tuple[NDArray[np.complex128], Array]] = []
+    wandering: list[tuple[Prediction, list[int], Callable[[str], Array]]] = []
     left_out = []
     for effect, rows in _effects_on_rows(model, axes):
         of_effect = tuple(axes[row] for row in rows)
@@ -95,17 +96,18 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
                 coherent.append((factor, density))
             if prediction.line is not None and factor.any():
                 narrow.append((effect, rows, power))
-        random.add(prediction, rows, sizes)
+        wandering.append((prediction, rows, sizes))
     white_response = response[:, None, :, NOISE.index("N")]
     noise = np.einsum("fn,afn,abn->abf", band_columns(blocks), response, np.maximum(squares, 0.0))
     spectrum = spread_by_gaps((noise + added * white_response) * left[..., None], blocks)
     variables = _shared_cross(coherent, white_response, blocks)
-    if (response != 1.0).any() and "line_power" in blocks:
+    if (response != 1.0).any():
         variables["line_noise"] = _filtered_lines(model, square, blocks)
-    if narrow and "line_power" in blocks:
+    if narrow:
         variables |= expect_lines(blocks, narrow, white_response[:, 0])
-    white_share = 1.0 - random.power / spectrum[..., 0]
-    return KnownEffects(mean, spectrum, white_share, variables | random.variables(), left_out)
+    processes, power = _random_means(wandering, shape)
+    white_share = 1.0 - power / spectrum[..., 0]
+    return KnownEffects(mean, spectrum, white_share, variables | processes, left_out)
 
 
 def _effects_on_rows(model: Model, axes: list[str]) -> Iterator[tuple[Effect, list[int]]]:
@@ -135,18 +137,16 @@ def filtered_blocks(blocks: xr.Dataset, model: Model) -> xr.Dataset:
 
     Where some lines of a band dominate, its power has those of fewer lines.
     """
-    if "line_power" not in blocks or not any(
-        isinstance(effect, LoggerFilter) for effect in model.effects
-    ):
+    if not any(isinstance(effect, LoggerFilter) for effect in model.effects):
         return blocks
     axes = map(str, blocks["axis"].values)
     square = np.array([[model.coefficients(axis)[term] ** 2 for term in NOISE] for axis in axes])
     share = independent_line_share(_filtered_lines(model, square, blocks), blocks)[:, None]
-    shapes = {"shape": blocks["shape"] * share}
-    if "cross_shape" in blocks:
-        first, second = pair_indices(blocks)
-        shapes["cross_shape"] = blocks["cross_shape"] * np.sqrt(share[first] * share[second])
-    return blocks.assign(shapes)
+    first, second = pair_indices(blocks)
+    return blocks.assign(
+        shape=blocks["shape"] * share,
+        cross_shape=blocks["cross_shape"] * np.sqrt(share[first] * share[second]),
+    )
 
 
 def _share_left(effect: Effect, model: Model, rows: list[int], blocks: xr.Dataset) -> Array:
@@ -180,38 +180,36 @@ def _added_powers(
         yield factor, density
 
 
-class _RandomMeans:
-    """Sums of random means over effects; whatever they add is not white noise of the means."""
+def _random_means(
+    wandering: Sequence[tuple[Prediction, list[int], Callable[[str], Array]]],
+    shape: tuple[int, ...],
+) -> tuple[dict[str, NDArray[Any]], Array]:
+    """Return the steady processes of effects as variables, and their power in the lowest band.
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self.shape = shape
-        self.processes: list[tuple[Array, float]] = []  # variance on each axis, correlation time
-        # variance rate of random walks, and power of all in the lowest band
-        self.walk, self.power = np.zeros((2, *shape[:2]))
-
-    def add(self, prediction: Prediction, rows: list[int], sizes: Callable[[str], Array]) -> None:
-        """Add the steady processes of an effect, with its sizes on the axes of these rows."""
+    Whatever they add there is not white noise of the means. Each effect comes with its rows, and
+    its sizes on them.
+    """
+    processes: list[tuple[Array, float]] = []  # variance on each axis, correlation time
+    walk, power = np.zeros((2, *shape[:2]))  # variance rate of random walks, and power of all
+    for prediction, rows, sizes in wandering:
         for name, (time, variance) in prediction.wander.items():
             if prediction.levels or not _is_steady(time, variance):
                 continue
-            square = np.zeros(self.shape[0])
+            square = np.zeros(shape[0])
             square[rows] = sizes(name) ** 2
             if np.isinf(time):
-                self.walk += square[:, None] * variance
+                walk += square[:, None] * variance
             else:
-                self.processes.append((square * variance[0], time))
+                processes.append((square * variance[0], time))
             if name in prediction.spectrum:
                 density = np.asarray(prediction.spectrum[name])
-                by_band = density.reshape(-1, *self.shape[1:], density.shape[-1] // self.shape[2])
-                self.power += square[:, None] * by_band[0, :, 0].mean(axis=-1)
-
-    def variables(self) -> dict[str, NDArray[Any]]:
-        """Return the variables of the baseline, if there are any."""
-        squares = np.array([square for square, _ in self.processes]).reshape(-1, self.shape[0]).T
-        if not (squares.any() or self.walk.any()):
-            return {}
-        times = np.array([time for _, time in self.processes])
-        return {"wander_square": squares, "wander_time": times, "wander_walk": self.walk}
+                by_band = density.reshape(-1, *shape[1:], density.shape[-1] // shape[2])
+                power += square[:, None] * by_band[0, :, 0].mean(axis=-1)
+    squares = np.array([square for square, _ in processes]).reshape(-1, shape[0]).T
+    if not (squares.any() or walk.any()):
+        return {}, power
+    times = np.array([time for _, time in processes])
+    return {"wander_square": squares, "wander_time": times, "wander_walk": walk}, power
 
 
 def _shows_elsewhere(prediction: Prediction) -> bool:
@@ -239,8 +237,6 @@ def _shared_cross(
 
     An effect has a factor on each axis, and a density (axis, block, band) for a factor of 1.
     """
-    if "cross" not in blocks:
-        return {}
     first, second = pair_indices(blocks)
     shared = np.zeros(blocks["cross"].shape, np.complex128)
     for factor, density in coherent:
@@ -271,7 +267,8 @@ def remove_known_motion(
     if not moving.any():
         return blocks
     still = xr.DataArray(~moving, dims=("axis", "block"))
-    out = blocks.assign(
-        {name: blocks[name].where(still) for name in ("power", "kurtosis") if name in blocks}
+    return blocks.assign(
+        power=blocks["power"].where(still),
+        kurtosis=blocks["kurtosis"].where(still),
+        cross=cross_without(blocks, moving),
     )
-    return out.assign(cross=cross_without(blocks, moving)) if "cross" in blocks else out
