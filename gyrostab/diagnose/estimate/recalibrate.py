@@ -276,6 +276,7 @@ def _fit_noise(
     reduced = shape * share[:, None]
     fit = _average_groups(power, reduced, columns, state.weight[row], axis_effects, chosen)
     square, information, _ = fit_squares(fit)
+    assert fit.start is not None
     plain = float((fit.weight / np.square(fit.start) * fit.columns[:, 1] ** 2).sum())
     if not information[1, 1] > state.settings.min_information_share * plain or not square[1] > 0.0:
         return None

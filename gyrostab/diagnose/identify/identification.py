@@ -30,7 +30,7 @@ class Selection:
     """
 
     #: Name in the registry, or one of
-    #: `gyrostab.diagnose.identify.nuisance_alternatives.NUISANCE_ALTERNATIVES`.
+    #: `gyrostab.diagnose.identify.examination.NUISANCE_ALTERNATIVES`.
     effect: str
     driver: tuple[str, ...]  # channels of the log that it follows, in the order of the effect's
     axes: tuple[str, ...]
