@@ -170,12 +170,17 @@ def test_tiny_share_of_the_rotation_is_a_scale_factor_error():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stick_slip", [0.0, 0.3])
-def test_earth_rate_is_the_only_effect_on_a_tool_that_starts_to_rotate(stick_slip: float):
-    """It is constant at rest and a line while the tool rotates: no accelerometer explains both."""
+@pytest.mark.parametrize(("speed", "stick_slip"), [(90, 0.0), (90, 0.3), (720, 0.6)])
+def test_earth_rate_is_the_only_effect_on_a_tool_that_starts_to_rotate(
+    speed: float, stick_slip: float
+):
+    """It is constant at rest and a line while the tool rotates: no accelerometer explains both.
+
+    Stick-slip adds side bands to the line, and moves the means.
+    """
     rotation = {
         "profile": "rotation",
-        "points": [[0, 0], [900, 0], [910, 90], [3000, 90], [3010, 0]],
+        "points": [[0, 0], [900, 0], [910, speed], [3000, speed], [3010, 0]],
         "sensor_rate": 50,
         "stick_slip": stick_slip,
         "period": "4 s",
