@@ -24,9 +24,17 @@ from gyrostab.blindtest.generator.measured_noise import (
     measure_noise,
 )
 from gyrostab.blindtest.generator.record import make_log
-from gyrostab.blindtest.generator.scenario import draw_scenario
-from gyrostab.blindtest.scenarios.injection import estimate_noise, inject_effect
+from gyrostab.blindtest.generator.scenario import AXES, draw_scenario
+from gyrostab.blindtest.scenarios.case import make_case
+from gyrostab.blindtest.scenarios.injection import (
+    estimate_noise,
+    inject_effect,
+    quantization_step,
+)
 from gyrostab.blindtest.scenarios.real import plan_injections
+from gyrostab.errors import OptionError
+from gyrostab.schema import check_log
+from tests.support.blind_cases import small
 
 RATE, SECONDS = 20.0, 1500.0
 
@@ -237,3 +245,64 @@ def test_half_of_the_injections_have_the_strength_from_which_most_should_be_name
     strengths = [plan["strength"] for plan in plan_injections(400, seed=3)[::4]]
     assert set(strengths) == {3.0, 5.0, 8.0}
     assert 0.4 < strengths.count(5.0) / len(strengths) < 0.6
+
+
+def test_injection_adds_the_effect_and_leaves_controls_unchanged():
+    log, _ = make_case(small(None))
+    copies = inject_effect(log, "vibration_rectification", 6.0, np.random.default_rng(2))
+    record = log.rate.values
+    np.testing.assert_array_equal(copies["untouched"][0].rate.values, record)
+    np.testing.assert_array_equal(copies["flipped"][0].rate.values, -record)
+    np.testing.assert_array_equal(copies["reversed"][0].rate.values, record[:, ::-1])
+    injected, truth = copies["injected"]
+    (effect,) = truth["effects"]
+    added = injected.rate.values - record
+    assert np.nanmax(np.abs(added)) == pytest.approx(effect["parameters"]["peak"]["value"], rel=0.1)
+    for axis in AXES:
+        assert (np.nanmax(np.abs(added[AXES.index(axis)])) > 0) == (axis in effect["axes"])
+    for copy, copy_truth in copies.values():
+        check_log(copy)
+        assert set(copy.data_vars) == set(injected.data_vars)
+        kind = "injected" if copy_truth["effects"] else "control"
+        assert copy_truth["plan"]["kind"] == kind
+    with pytest.raises(OptionError, match="follows restarts"):
+        inject_effect(log, "warm_up", 2.0, np.random.default_rng(0))
+
+
+def test_injection_into_a_quantized_log_keeps_step_and_mean():
+    log, _ = make_case(small(None, rate=10.0, seconds=1200))
+    counted = np.rint(log.rate.values / 0.5) * 0.5
+    copies = inject_effect(
+        log.assign(rate=(log.rate.dims, counted, log.rate.attrs)),
+        "vibration_rectification",
+        8.0,
+        np.random.default_rng(2),
+    )
+    injected, truth = copies["injected"]
+    is_finite = np.isfinite(counted)
+    assert quantization_step(counted[0]) == pytest.approx(0.5)
+    np.testing.assert_allclose(
+        np.remainder(injected.rate.values[is_finite] / 0.5 + 0.25, 1.0), 0.25, atol=1e-6
+    )
+    sent = {axis: np.array(values) for axis, values in truth["effects"][0]["waveform_10s"].items()}
+    axis, expected = max(sent.items(), key=lambda item: np.ptp(item[1]))
+    row = list(injected.axis.values).index(axis)
+    added = np.nanmean((injected.rate.values - counted)[row].reshape(-1, 100), axis=1)
+    scatter = 0.5 / math.sqrt(12 * 100)
+    assert np.nanmax(np.abs(added - expected)) < 8 * scatter
+
+
+def test_injection_into_a_real_gyro_log(recordings):
+    import pandas as pd
+
+    from gyrostab.ingest.make_log import make_log
+
+    table = pd.read_csv(recordings("rlg-static-30min/lasergyro.csv.gz"), nrows=60_000)
+    gyros = [column for column in table.columns if column.lower().startswith(("gyro", "w", "g"))][
+        :3
+    ]
+    log = make_log(table[gyros].to_numpy().T, rate=100.0, unit="deg/h")
+    copies = inject_effect(log, "spectral_line", 5.0, np.random.default_rng(4))
+    added = copies["injected"][0].rate.values - log.rate.values
+    assert np.abs(added).max() > 0
+    assert copies["injected"][1]["effects"][0]["name"] == "spectral_line"

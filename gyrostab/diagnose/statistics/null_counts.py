@@ -38,7 +38,7 @@ def null_counts(
     """
     samples = blocks["samples"].values.astype(np.int64)
     adjacent = blocks["adjacent"].values.astype(np.int64)
-    mean = [_interpolate(row, np.isfinite(row)) for row in blocks["mean"].values]
+    mean = [_interpolate_missing(row, np.isfinite(row)) for row in blocks["mean"].values]
     scatter, correlation = _neighbour_statistics(blocks, sd)
     truncated = truncated_axes(blocks)
     nothing = np.zeros(samples.shape[1])
@@ -89,9 +89,9 @@ def _neighbour_statistics(blocks: xr.Dataset, sd: Array) -> tuple[Array, Array]:
         typical = good & (blocks["outliers"].values[axis] == 0)
         good = typical if typical.any() else good
         if good.any():
-            scatter[axis] = np.sqrt(_interpolate(variance, good))
+            scatter[axis] = np.sqrt(_interpolate_missing(variance, good))
             with np.errstate(divide="ignore", invalid="ignore"):
-                correlation[axis] = _interpolate(lagged / variance, good)
+                correlation[axis] = _interpolate_missing(lagged / variance, good)
         else:
             scatter[axis] = sd[axis, 0]
             correlation[axis] = 1.0 - 0.5 * (sd[axis, 1] / sd[axis, 0]) ** 2
@@ -126,7 +126,7 @@ def _filled_zeros(
     return zeros_beyond_chance(coinciding, zeros, samples, subset, number)
 
 
-def _interpolate(values: Array, good: NDArray[np.bool_]) -> Array:
+def _interpolate_missing(values: Array, good: NDArray[np.bool_]) -> Array:
     """Interpolate between good values; 0 without any."""
     place = np.arange(values.size)
     return np.interp(place, place[good], values[good]) if good.any() else np.zeros(values.size)

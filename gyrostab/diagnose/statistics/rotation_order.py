@@ -135,7 +135,6 @@ class RotationOrder(Statistic):
         An uneven rotation or gaps spread a harmonic over many bands and lines.
         """
         count = state.blocks.sizes["harmonic"]
-        sizes = _fit_sizes_of(component, state)
         if component.candidate.is_per_axis:
             chosen = harmonic_sets(count)[component.place]
             patterns = [(axis, np.ones(count, np.complex128)) for axis in component.row]
@@ -144,6 +143,8 @@ class RotationOrder(Statistic):
             if is_reversed(component):
                 pattern = np.conj(pattern)
             patterns = [(axis, pattern[state.axes.index(axis)]) for axis in component.row]
+        mean, _ = component_mixture(component, state).moments()
+        sizes = np.hypot(*mean[: 2 * len(chosen)].reshape(-1, 2).T)  # of a pattern of 1
         masked = np.zeros(state.blocks.sizes["line"], np.bool_)
         for axis, pattern in patterns:
             state = state.with_columns("order", axis, order_columns(pattern, chosen))
@@ -245,17 +246,6 @@ def fit_amplitude(component: Component, state: State) -> tuple[float, float, flo
     mean, covariance = component_mixture(component, state).moments()
     sd = float(math.sqrt(np.trace(covariance[:2, :2]) / 2.0))
     return float(math.hypot(mean[0], mean[1])), sd, math.degrees(math.atan2(mean[1], mean[0]))
-
-
-def _fit_sizes_of(component: Component, state: State) -> list[float]:
-    """Return the amplitudes of the harmonics of a component, of a pattern of 1."""
-    mean, _ = component_mixture(component, state).moments()
-    count = 2 * len(
-        harmonic_sets(state.blocks.sizes["harmonic"])[component.place]
-        if component.candidate.is_per_axis
-        else (0,)
-    )
-    return [float(math.hypot(*mean[place : place + 2])) for place in range(0, count, 2)]
 
 
 def _visible_bands(density: Array, axis: str, state: State) -> NDArray[np.bool_]:

@@ -27,8 +27,8 @@ from gyrostab.kernels.compiled import KERNEL
 def filter_gains(variance, present, walk, ou_variance, decay):  # type: ignore[no-untyped-def]
     """Run a Kalman filter that observes the sum of its states: innovation variances and gains.
 
-    `variance` (n,) is the white variance of each observation, ``present`` (n,) is False where there
-    is none, `walk` (n,) is the increase of the variance of the random walk until the next
+    `variance` (n,) is the white variance of each observation, ``present`` (n,) is False where it
+    is missing, `walk` (n,) is the increase of the variance of the random walk until the next
     observation, and `ou_variance` (q - 1,) are the variances of the relaxing processes.
     """
     n, q = decay.shape
