@@ -193,7 +193,9 @@ def test_earth_rate_is_the_only_effect_on_a_tool_that_starts_to_rotate(
         "effect": [earth],
     }
     log = simulate(model, duration="1h", rate=10.0, seed=3).compute()
-    (effect,) = diagnose(log, nulls=100, seed=1).effects
+    found = diagnose(log, nulls=100, seed=1)
+    (effect,) = found.effects
     assert (effect["name"], effect["axes"]) == ("earth_rate", ["x", "y"])
+    assert found.verdict == "explained"
     # towards the high side 9.77 deg/h, and to the right of it -6.51 deg/h
     assert effect["parameters"]["toolface"]["value"] == pytest.approx(33.7, abs=1.0)

@@ -1,4 +1,4 @@
-"""Jumps of the bias are searched at all times, most of all at restarts."""
+"""Times of jumps are searched everywhere; earth rate follows the turns of the tool."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
-from gyrostab.diagnose.predict.windows import select_step_times
+from gyrostab.diagnose.predict.windows import predict_effect, select_step_times
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.physics.prediction import Windows
+from gyrostab.physics.registry import make_effect
+from gyrostab.simulate import simulate
 from tests.support.candidates import select_candidate
 from tests.support.named import COEFFICIENT, record
 
@@ -101,3 +104,26 @@ def test_a_jump_at_a_restart_needs_less_evidence(restarted):
     ]
     assert (evidence[0].evidence_nats > evidence[1].evidence_nats + 0.5).any()
     assert {variant.values["at"] for variant in evidence[0].best} == {_BACK}
+
+
+def test_means_of_earth_rate_follow_the_turns_within_each_block():
+    earth = {"name": "earth_rate", "latitude": 60, "inclination": 30, "azimuth": 60}
+    rotation = {
+        "profile": "rotation",
+        "points": [[0, 90.0]],
+        "sensor_rate": 50,
+        "stick_slip": 0.6,
+        "period": "7.3 s",
+        "inclination": 30,
+    }
+    model = {"noise": {"N": 1e-5}, "environment": [rotation], "effect": [earth]}
+    log = simulate(model, duration="20min", rate=10.0, seed=3).compute()
+    blocks = reduce_log(log, block="20s")
+    mean = blocks["mean"].values
+    effect = make_effect(earth)
+    predicted = effect.rate * predict_effect(effect, blocks, ("x", "y", "z")).mean["rate"]
+    assert np.ptp(mean[:2], axis=1).min() > 0.3
+    np.testing.assert_allclose(predicted, mean, atol=0.02)
+    even = blocks.drop_vars("turn_mean")
+    unlike = effect.rate * predict_effect(effect, even, ("x", "y", "z")).mean["rate"]
+    assert np.abs(unlike - mean).max() > 0.2
