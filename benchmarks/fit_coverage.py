@@ -24,7 +24,7 @@ from tests.support.noise_records import flicker, lose, quantization, random_walk
 
 N = 0.01
 #: Length [s], rate [Hz] and number of windows.
-LENGTHS = ((40.0, 100.0, 1000), (600.0, 100.0, 200), (7200.0, 10.0, 200))
+LENGTHS = ((40.0, 100.0, 1000), (600.0, 100.0, 1000), (7200.0, 10.0, 1000))
 PAIRS = list(itertools.combinations_with_replacement(range(5), 2))
 MIXTURES = ("", "Qm", "Qs", "Bm", "Bs", "Km", "Ks", "Rm", "Rs", "QmBmKmRm", "QsBsKsRs", "KsRm")
 
