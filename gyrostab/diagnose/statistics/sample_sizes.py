@@ -7,20 +7,24 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
+from scipy.optimize import brentq
 from scipy.special import gammaincinv, ndtr, ndtri
 
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.reduce.outliers import outlier_limit
-from gyrostab.diagnose.reduce.schema import axis_values
+from gyrostab.diagnose.reduce.schema import axis_values, weighted_mean
 from gyrostab.diagnose.settings import INTERVAL_TAILS, Settings
 from gyrostab.noise import NORMAL_95
 from gyrostab.units import HOUR
 
+Array = NDArray[np.float64]
 #: Standard deviation of the difference of white noise and the median of its eight neighbours, in
 #: standard deviations of the noise.
 MEDIAN_DEPARTURE_SIGMA = 1.08
 VARIANCE_TOLERANCE_SHARE = 0.2  # by which chance may raise the variance of a single block
 _MIN_LIMITED = 2  # samples at an end of the range that is a limit
+_ROUNDS = 30  # of a fixed-point iteration
 MIN_CLEAN_BLOCKS = 5  # without an outlier, that determine the noise level
 
 
@@ -65,10 +69,6 @@ def estimate_from_counts(
                 length * runs / low,
             ),
         }
-    low, high = (end - usual for end in _poisson_interval(count + usual))
-    share, low_share, high_share = (
-        min(max(number, 0.0) / samples, 0.999) for number in (count, low, high)
-    )
     if effect == "clipping":
         return {"limit": _size_range(blocks.sel(axis=axis), spread, samples)}
     if effect == "dead_zone" and has_empty_zone(blocks, axis):
@@ -78,29 +78,60 @@ def estimate_from_counts(
         # the least of many samples beyond the zone is that far from its edge, by an exponential law
         return {"width": (width, error, width + error * math.log(INTERVAL_TAILS[0]), width)}
     if effect == "dead_zone":
-        width, narrow, wide = (
-            spread * _zone_width(fraction) for fraction in (share, low_share, high_share)
+        samples_of, means, variances = (
+            axis_values(blocks, name, axis).astype(np.float64)
+            for name in ("samples", "mean", "variance")
         )
+        good = np.isfinite(means) & (samples_of > 0.0)
+        centre = float(np.nan_to_num(blocks["zone_centre"].sel(axis=axis)))
+        variance = float(weighted_mean(variances, samples_of)[0])
+        law = samples_of[good], means[good] - centre, variance
+        low, high = (end - usual for end in _poisson_interval(count + usual))
+        width, narrow, wide = (_zone_width(number / samples, *law) for number in (count, low, high))
         return {"width": (width, (wide - narrow) / (2.0 * NORMAL_95), narrow, wide)}
     return {}
 
 
-def _zone_width(share: float) -> float:
-    """Return the half-width of a zone that holds a share of the samples, in their scatter.
+def _zone_width(stuck: float, samples: Array, away: Array, variance: float) -> float:
+    """Return the half-width of a zone at which this share of the samples sticks.
 
-    Samples are normal, and those outside the zone are reduced by its width, which reduces their
-    scatter.
+    Outside the zone, the rate is reduced by its width. `samples` are those of each block, `away`
+    the block means from the centre of the zone, and `variance` that of the samples about them. The
+    samples of a block are normal without the zone; `away` and `variance` give their laws.
 
     Examples
     --------
-    >>> samples = np.random.default_rng(1).standard_normal(100_000)
-    >>> samples -= np.clip(samples, -0.5, 0.5)
-    >>> round(float(_zone_width(np.mean(samples == 0.0)) * samples.std()), 2)
+    >>> true_rate = np.linspace(-2.0, 2.0, 50)[:, None]
+    >>> rate = true_rate + np.random.default_rng(1).standard_normal((50, 9000))
+    >>> rate -= np.clip(rate, -0.5, 0.5)
+    >>> means, count = rate.mean(axis=1), np.full(50, 9000)
+    >>> round(_zone_width((rate == 0.0).mean(), count, means, rate.var(axis=1).mean()), 2)
     0.5
     """
-    edge = float(ndtri(0.5 + share / 2.0))  # in the scatter without the zone
-    outside = (1.0 + edge**2) * float(ndtr(-edge)) - edge * float(_normal_density(edge))
-    return edge / math.sqrt(2.0 * outside)
+    weight = samples / samples.sum()
+
+    def fit_noise(edge: float) -> tuple[float, float]:
+        """Return the scatter of the noise and the share that sticks, for a width of `edge`."""
+        rate = np.linspace(-edge - 6.0, edge + 6.0, 2001)  # [in the scatter], as `edge`
+        above, below = rate - edge, -rate - edge
+        share = ndtr(edge - rate) - ndtr(-edge - rate)
+        mean = above * ndtr(above) + _normal_density(above)
+        mean -= below * ndtr(below) + _normal_density(below)
+        square = (1.0 + above**2) * ndtr(above) + above * _normal_density(above)
+        square += (1.0 + below**2) * ndtr(below) + below * _normal_density(below)
+        scatter = math.sqrt(variance)
+        for _ in range(_ROUNDS):
+            place = np.interp(away / scatter, mean, rate)
+            left = float(weight @ np.interp(place, rate, square - mean**2))
+            scatter = math.sqrt(variance / max(left, 1e-12))
+        return scatter, float(weight @ np.interp(place, rate, share))
+
+    narrow, wide = 1e-9, 6.0  # all samples stick in a zone of 6 standard deviations
+    if stuck >= fit_noise(wide)[1]:
+        edge = wide
+    else:
+        edge = float(brentq(lambda edge: fit_noise(edge)[1] - max(stuck, 0.0), narrow, wide))
+    return edge * fit_noise(edge)[0]
 
 
 def has_empty_zone(blocks: xr.Dataset, axis: str) -> bool:
