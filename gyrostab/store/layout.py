@@ -85,13 +85,17 @@ class _ZarrLayout:
     separator: str
 
 
-def is_readable(path: Path, name: str, encoding: dict[Any, Any]) -> bool:
-    """Whether `read_chunk` can read a variable; `encoding` is that of xarray.
+def is_readable(path: Path, name: str) -> bool:
+    """Whether `read_chunk` can read a variable.
 
     Every log that gyrostab wrote can be read; another program may have changed the layout.
     """
     if not path.is_dir():
-        return not any(encoding.get(filters) for filters in ("szip", "bzip2", "blosc"))
+        import h5py
+
+        with library_lock(), h5py.File(path, "r") as file:
+            codecs = find_hdf5_codecs(file[name].id.get_create_plist())
+        return not any(isinstance(codec, _UnknownFilter) for _, codec in codecs)
     try:
         return bool(json.loads((path / name / ".zarray").read_bytes())["order"] == "C")
     except (OSError, ValueError, KeyError, TypeError):

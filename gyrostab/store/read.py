@@ -176,7 +176,7 @@ def _find_long_variables(stored: xr.Dataset, path: Path, *, strict: bool) -> dic
         if not _is_sampled(variable) or chunks is None:
             continue
         dim = str(variable.dims[-1])
-        is_known = all(size == 1 for size in chunks[:-1]) and is_readable(path, str(name), disk)
+        is_known = all(size == 1 for size in chunks[:-1]) and is_readable(path, str(name))
         has_fill = "scale_factor" not in disk or "_FillValue" in disk
         if not is_known or not has_fill or _FOREIGN_PACKING & set(disk):
             continue  # some other program has written it anew

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import h5py
 import netCDF4
 import numpy as np
 import pytest
@@ -61,3 +62,26 @@ def test_a_damaged_heap_is_found(tmp_path):
     path.write_bytes(data)
     with pytest.raises(FormatError, match="global heap"):
         open_log(path)
+
+
+@pytest.mark.parametrize("filters", [{"scaleoffset": 0}, {"compression": "lzf"}])
+def test_a_log_rewritten_with_another_filter_is_read_or_refused(tmp_path, filters):
+    path = tmp_path / "log.nc"
+    _write_log(path)
+    expected = open_log(path).rate.values
+    with h5py.File(path, "a") as file:
+        old = file["rate"]
+        values, attributes = old[:], dict(old.attrs)
+        scales = [dim[0].name for dim in old.dims]
+        del file["rate"]
+        new = file.create_dataset("rate", data=values, chunks=(1, 1000), **filters)
+        for place, scale in enumerate(scales):
+            new.dims[place].attach_scale(file[scale])
+        for name, value in attributes.items():
+            if name not in ("DIMENSION_LIST", "_Netcdf4Coordinates", "_Netcdf4Dimid"):
+                new.attrs[name] = value
+    if "compression" in filters:  # no library has this filter
+        with pytest.raises(FormatError, match="Filter error"):
+            open_log(path).rate.load()
+    else:
+        np.testing.assert_array_equal(open_log(path).rate.values, expected)
