@@ -10,8 +10,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
 
 import gyrostab
-from gyrostab.plot.diagnosis import plot_change
 from gyrostab.plot.style import save_png
+from gyrostab.report.diagnosis_charts import draw_change
+from gyrostab.report.static import draw_static
 from tests.support.published import fit_deviations
 
 
@@ -131,5 +132,6 @@ if __name__ == "__main__":
             re.sub(pattern, put, page.read_text(encoding="utf-8"), flags=re.S), encoding="utf-8"
         )
     drawn = runs[plan["drawn"]]
-    save_png(plot_change(drawn.surfaces, drawn.content), folder / plan["figure"], **plan["figures"])
+    picture = draw_static(draw_change(drawn.surfaces, drawn.content))
+    save_png(picture, folder / plan["figure"], **plan["figures"])
     print(*runs.values(), sep="\n\n")

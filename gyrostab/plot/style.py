@@ -274,15 +274,11 @@ def save_png(
         Image.open(drawn).convert("RGB").quantize(colours).save(target, format="PNG", optimize=True)
 
 
-def embedded(figure: Figure, name: str, alt: str) -> dict[str, str]:
-    """Prepare a figure for a self-contained page: PNG in base 64, name, short description."""
+def encode_png(figure: Figure) -> str:
+    """Return a figure as PNG in base 64, for a self-contained page."""
     buffer = io.BytesIO()
     save_png(figure, buffer)
-    return {
-        "png": base64.b64encode(buffer.getvalue()).decode("ascii"),
-        "name": name,
-        "alt": alt,
-    }
+    return base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
 def write_in_middle(panel: Axes, text: str) -> None:

@@ -35,6 +35,7 @@ class Chart:
     title: str
     note: str
     figure: str  # plotly figure as JSON that can stand in a script element
+    png: str = ""  # its picture in base 64, shown in print and without JavaScript
 
 
 @functools.cache

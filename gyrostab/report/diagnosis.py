@@ -24,7 +24,7 @@ from gyrostab.diagnose.result.text import (
 )
 from gyrostab.diagnose.statistics.wording import axes_text, length_text
 from gyrostab.noise import LAWS
-from gyrostab.plot.style import embedded, unit_symbol
+from gyrostab.plot.style import unit_symbol
 from gyrostab.report.charts import page_text
 from gyrostab.report.diagnosis_charts import diagnosis_charts
 from gyrostab.store.output import new_output
@@ -74,7 +74,6 @@ def write_diagnosis_report(
                 row for row in rows if not any(row in card["mismatches"] for card in cards)
             ],
             charts=diagnosis_charts(diagnosis.surfaces, content),
-            figures=_make_figures(diagnosis),
             limits=sorted(
                 content["not_found"].items(),
                 key=lambda item: (item[1]["upper_limit"] is None, item[0]),
@@ -125,23 +124,3 @@ def _effect_card(
             if effect["name"] in region["explained_by"] and axes & set(region["axes"])
         ],
     }
-
-
-def _make_figures(diagnosis: Diagnosis) -> list[dict[str, str]]:
-    from gyrostab.plot.diagnosis import (
-        plot_change,
-        plot_deviations,
-        plot_means,
-        plot_spectra,
-        plot_surfaces,
-    )
-
-    surfaces, content = diagnosis.surfaces, diagnosis.content
-    figures = {
-        "surfaces": (plot_surfaces(surfaces, content), "Recording, simulation before and after"),
-        "change": (plot_change(surfaces, content), "Where they differ"),
-        "means": (plot_means(surfaces, content), "Mean rate over time, and what drives it"),
-        "deviations": (plot_deviations(surfaces), "Allan deviation of the whole record"),
-        "spectra": (plot_spectra(surfaces), "Power spectrum of the whole record"),
-    }
-    return [embedded(figure, name, alt) for name, (figure, alt) in figures.items()]

@@ -10,8 +10,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.noise import NORMAL_95
-from gyrostab.plot.diagnosis import find_change, find_regions, select_channels
 from gyrostab.plot.style import COLOURS, axis_names, axis_style, unit_label
+from gyrostab.plot.surface import CHANGE_CMAP
 from gyrostab.report.charts import (
     DEVIATION_LABEL,
     SYMBOLS,
@@ -25,12 +25,15 @@ from gyrostab.report.charts import (
     single,
     stacked_panels,
 )
+from gyrostab.report.static import static_png
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
 _RED = "#D00000"
 _CASES = {"before": "simulation before", "after": "simulation after"}
+_MAX_CHANNELS = 3  # panels below the means
+_INSIDE_BAND_OPACITY = 0.3  # of cells inside the 95 % band
 
 
 def diagnosis_charts(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[Chart]:
@@ -39,15 +42,58 @@ def diagnosis_charts(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[C
     `surfaces` and `content` are the contents of ``diagnosis.nc`` and ``diagnosis.json``.
     """
     draw: dict[str, tuple[str, Callable[..., go.Figure]]] = {
-        "change": ("Where recording and simulation differ", _draw_change),
+        "change": ("Where recording and simulation differ", draw_change),
         "means": ("Mean rate over time, and what drives it", _draw_means),
         "deviations": ("Allan deviation of the whole record", _draw_deviations),
         "spectra": ("Power spectrum of the whole record", _draw_spectra),
     }
+    figures = {name: function(surfaces, content) for name, (_, function) in draw.items()}
     return [
-        Chart(name, title, "", embeddable(function(surfaces, content).to_json()))
-        for name, (title, function) in draw.items()
+        Chart(name, draw[name][0], "", embeddable(figure.to_json()), static_png(figure))
+        for name, figure in figures.items()
     ]
+
+
+def _find_regions(
+    content: Mapping[str, Any], axis: str, *, over_tau: bool
+) -> list[Mapping[str, Any]]:
+    """Find the mismatches of an axis over averaging times, or those of its mean rate."""
+    views = ("davar", "cross_axis") if over_tau else ("mean", "restart")
+    return [
+        region
+        for region in content["mismatches"]
+        if axis in region["axes"]
+        and region["view"] in views
+        and (region["tau_min_s"] or not over_tau)
+    ]
+
+
+def _find_change(
+    surfaces: xr.Dataset, case: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Divide the Allan deviation of the recording by that of a simulation, (axis, tau, window).
+
+    The second array is the opacity of each cell, less inside the 95 % band of the simulation.
+    """
+    names = ["avar", "avar_low", "avar_high"]
+    cells = surfaces[names].transpose("case", "axis", "tau", "window")
+    recording = cells["avar"].sel(case="recording").values
+    avar, low, high = (cells[name].sel(case=case).values for name in names)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.sqrt(recording / avar)
+        is_usual = (recording >= low) & (recording <= high)
+    return ratio, np.where(is_usual, _INSIDE_BAND_OPACITY, 1.0)
+
+
+def _select_channels(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[str]:
+    """Return the channels to draw: first those that named effects follow."""
+    drivers = [str(effect["driver"] or "").split(",") for effect in content["effects"]]
+    named = [name.strip() for names in drivers for name in names]
+    return [
+        name
+        for name in dict.fromkeys([*named, "temperature", "vibration", "rotation_rate"])
+        if f"channel_{name}" in surfaces and np.isfinite(surfaces[f"channel_{name}"]).any()
+    ][:_MAX_CHANNELS]
 
 
 def _centre_stamps(
@@ -59,18 +105,18 @@ def _centre_stamps(
     return np.asarray(start / 1e6 + 1e3 * seconds)
 
 
-def _draw_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
+def draw_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
     """Draw the recording over the simulations, by time and averaging time."""
     from plotly.subplots import make_subplots
 
     names, tau = axis_names(surfaces), surfaces["tau"].values
     frame = make_subplots(
         rows=len(names), cols=2, shared_xaxes="all", shared_yaxes="all",
-        horizontal_spacing=0.03, vertical_spacing=0.05,
+        horizontal_spacing=0.1, vertical_spacing=0.05,
         column_titles=["without the effects", "with the effects"],
     )  # fmt: skip
     for column, case in enumerate(_CASES, start=1):
-        ratio, opacity = (values.swapaxes(1, 2) for values in find_change(surfaces, case))
+        ratio, opacity = _find_change(surfaces, case)
         with np.errstate(divide="ignore"):
             colour = np.log2(ratio) * opacity
         for row in range(len(names)):
@@ -85,12 +131,13 @@ def _draw_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
         frame.update_yaxes(title={"text": title, "font": {"size": 12}}, col=1, row=row)
     frame.update_xaxes(type="date")
     for row, name in enumerate(names):
-        for region in find_regions(content, name, over_tau=True):
+        for region in _find_regions(content, name, over_tau=True):
             _frame_region(frame, region, row)
     figure = new_chart(
         height=170 * len(names) + 110,
+        plot_bgcolor="#e8e8e8",
         coloraxis={
-            "colorscale": "PuOr_r", "cmin": -1, "cmax": 1,
+            "colorscale": CHANGE_CMAP, "cmin": -1, "cmax": 1,
             "colorbar": {
                 "tickvals": [-1, -0.5, 0, 0.5, 1], "ticktext": ["≤ 0.5", "0.7", "1", "1.4", "≥ 2"],
             },
@@ -141,7 +188,7 @@ def _band_outline(
 
 def _draw_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
     """Draw the mean rate of each axis with both simulations, and the channels below."""
-    names, channels = axis_names(surfaces), select_channels(surfaces, content)
+    names, channels = axis_names(surfaces), _select_channels(surfaces, content)
     figure = stacked_panels(len(names) + len(channels), height=170)
     window, block = _centre_stamps(surfaces, content), _centre_stamps(surfaces, content, "block_")
     for row, name in enumerate(names):
@@ -160,14 +207,15 @@ def _draw_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
             common = {"mode": "lines", "legendgroup": case, **shared}
             figure.add_scatter(
                 x=place, y=single(edge), fill="toself", line={"width": 0}, hoverinfo="skip",
-                fillcolor=f"rgba{(*bytes.fromhex(colour[1:]), 0.18)}",
+                fillcolor=f"{colour}2e",
                 **(common | {"showlegend": False}),
             )  # fmt: skip
             figure.add_scatter(
                 x=window, y=single(mean), name=f"{title}, 95 %",
                 line={"color": colour, "dash": "solid" if number else "dash"}, **common,
             )  # fmt: skip
-        for region in find_regions(content, name, over_tau=False):
+        figure.layout[panel.replace("y", "yaxis")].range = _limit_means(part)
+        for region in _find_regions(content, name, over_tau=False):
             figure.add_shape(
                 type="rect", xref="x", yref=f"{panel} domain", x0=region["start"],
                 x1=region["end"], y0=0, y1=1, fillcolor=_RED, opacity=0.12, line={"width": 0},
@@ -183,6 +231,18 @@ def _draw_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
             showlegend=False,
         )  # fmt: skip
     return figure
+
+
+def _limit_means(part: xr.Dataset) -> tuple[float, float] | None:
+    """Find limits without the outermost 2 % of the block means, which would flatten the rest."""
+    mean, blocks = part["mean"].values, part["block_mean"].values
+    shown = mean[np.isfinite(mean)]
+    if np.isfinite(blocks).any():
+        shown = np.append(shown, np.nanquantile(blocks, [0.01, 0.99]))
+    if not shown.size:
+        return None
+    margin = 0.25 * np.ptp(shown) + 1e-12
+    return float(shown.min() - margin), float(shown.max() + margin)
 
 
 def _add_cases(

@@ -21,7 +21,7 @@ from gyrostab.plot.style import (
     PAGE_MM,
     draws_figure,
     duration,
-    embedded,
+    encode_png,
     label_log_axis,
     new_figure,
     time_axis,
@@ -66,7 +66,15 @@ def write_overview(
             trend_count=0 if trends is None else len(trends),
             trends=[] if trends is None else _describe_trends(trends),
             runs=[_describe_run(row, axes, path.parent) for row in done.to_dict("records")],
-            figures=[_make_figure(done, axes)] if len(done) and axes else [],
+            figures=[
+                {
+                    "png": encode_png(_plot_noise(done, axes)),
+                    "name": "noise",
+                    "alt": "N of each run over time",
+                }
+            ]
+            if len(done) and axes
+            else [],
         )
         temporary.write_text(text, encoding="utf-8")
     return path
@@ -197,10 +205,6 @@ def _describe_term(row: Mapping[Any, Any], term: str, axes: list[str]) -> dict[s
         else:
             texts.append(f"< {limit:.2g}" if np.isfinite(limit) else "–")
     return {"text": " / ".join(texts), "value": max(values)}
-
-
-def _make_figure(done: pd.DataFrame, axes: list[str]) -> dict[str, str]:
-    return embedded(_plot_noise(done, axes), "noise", "N of each run over time")
 
 
 @draws_figure

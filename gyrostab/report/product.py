@@ -12,7 +12,7 @@ import xarray as xr
 from gyrostab.allan.variance import variance_name
 from gyrostab.ingest.convert import as_log
 from gyrostab.noise import LAWS
-from gyrostab.plot.style import axis_names, duration, embedded, unit_symbol
+from gyrostab.plot.style import axis_names, duration, encode_png, unit_symbol
 from gyrostab.report.charts import page_text
 from gyrostab.report.product_charts import product_charts, window_data
 from gyrostab.schema import GAP_CAUSES, check_product, texts
@@ -252,4 +252,4 @@ def _make_figures(product: xr.Dataset, log: xr.Dataset | None) -> list[dict[str,
             for axis in axis_names(product)
         ),
     ]
-    return [embedded(figure, name, alt) for name, figure, alt in figures]
+    return [{"png": encode_png(figure), "name": name, "alt": alt} for name, figure, alt in figures]

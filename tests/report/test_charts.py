@@ -221,12 +221,15 @@ const probe = {
     return rows;
   },
   crowded() {
-    return Array.from(document.querySelectorAll(".xaxislayer-above")).flatMap((layer) => {
-      const labels = Array.from(layer.querySelectorAll("text"))
+    return Array.from(document.querySelectorAll(".chart")).flatMap((chart) => {
+      const labels = Array.from(chart.querySelectorAll(".xaxislayer-above text"))
+        .filter((label) => label.checkVisibility({ checkOpacity: true, checkVisibilityCSS: true }))
         .map((label) => ({ text: label.textContent, place: label.getBoundingClientRect() }))
         .filter(({ place }) => place.width > 0)
         .sort((a, b) => a.place.left - b.place.left);
-      return labels.slice(1).filter(({ place }, i) => place.left < labels[i].place.right + 2)
+      return labels.filter(({ place }, i) => labels.slice(0, i).some((other) =>
+        place.left < other.place.right + 2
+          && place.top < other.place.bottom && other.place.top < place.bottom))
         .map(({ text }) => text);
     });
   },

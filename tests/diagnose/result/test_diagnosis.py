@@ -41,7 +41,7 @@ from tests.support.diagnosed import content, diagnosis, model, surfaces
 @pytest.fixture
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the figures in tests that are about the text of a page."""
-    monkeypatch.setattr("gyrostab.report.diagnosis._make_figures", lambda _: [])
+    monkeypatch.setattr("gyrostab.report.diagnosis_charts.static_png", lambda _: "")
 
 
 plain_pages = pytest.mark.usefixtures("without_figures")
@@ -332,8 +332,8 @@ def page(tmp_path_factory) -> Page:
 
 def test_page_is_self_contained(page: Page):
     assert all(address.startswith("data:image/png;base64,") for address in page.addresses)
-    assert len(page.pictures) == 5
-    assert page.pictures[0] == "Recording, simulation before and after"
+    assert len(page.pictures) == 4
+    assert page.pictures[0] == "Where recording and simulation differ"
 
 
 def test_page_gives_size_time_evidence_alternatives_and_next_step(page: Page):
@@ -383,7 +383,7 @@ def test_page_has_all_figures_for_any_number_of_axes(tmp_path: Path, axes: str):
     page = write_diagnosis_report(
         Diagnosis(table, surfaces(axes=axes), model()), tmp_path / "report.html"
     )
-    assert page.read_text(encoding="utf-8").count("<img") == 5
+    assert page.read_text(encoding="utf-8").count("<img") == 4
 
 
 @plain_pages

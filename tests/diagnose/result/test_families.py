@@ -52,7 +52,7 @@ def test_many_lines_without_a_family_are_one_finding():
 def test_a_family_is_one_finding_in_text_and_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("gyrostab.report.diagnosis._make_figures", lambda _: [])
+    monkeypatch.setattr("gyrostab.report.diagnosis_charts.static_png", lambda _: "")
     lines = [
         {
             **content()["effects"][0],
