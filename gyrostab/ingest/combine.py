@@ -67,8 +67,8 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
             for part, names in zip(split_parts, slow_channels, strict=True)
         ]
         groups = _group_by_axes(ordered)
-        if "time" in ordered[0].variables:
-            groups = [drop_repeats(group) for group in groups]
+        if "time" in ordered[0].variables and signal is not None:
+            groups = [drop_repeats(group, signal) for group in groups]
         joined = _concatenate_parts([part for group in groups for part in group], signal, groups)
         apart = [
             part[names] for part, names in zip(split_parts, slow_channels, strict=True) if names

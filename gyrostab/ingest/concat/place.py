@@ -8,12 +8,11 @@ is unknown, and one sample is taken as missing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.ingest.concat.copies import COMPARED_SAMPLES, Match, match_ends
 from gyrostab.ingest.concat.grid import PlacedLog, Source, read_log_slice, runs_of
 from gyrostab.ingest.gap_table import (
     CLOCK_STEP,
@@ -26,9 +25,6 @@ from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import format_stamp
 from gyrostab.wording import list_some
 
-#: Smallest share of equal samples in a copy, which may be damaged.
-MIN_ALIKE_SHARE = 0.9
-
 #: Largest distance from the grid that is not noted [samples].
 NOTED_OFFSET_SAMPLES = 0.01
 #: Largest overlap of different values that is not taken as a step of the clock [samples], as for
@@ -38,83 +34,21 @@ MAX_OVERLAP_SAMPLES = 16
 #: stamps [samples].
 MAX_SHIFT_SAMPLES = 64
 
-_COMPARED_SAMPLES = 2**13  # samples at each end of an overlap whose values are compared
-_PROBED_SAMPLES = 64  # compared samples that are tried at every displacement
-_MIN_COMMON_SAMPLES = 32  # common samples needed to find a displacement
 _MAX_NAMED = 5  # events of one kind that are listed one by one
 
 
-def count_alike(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[Any, Any]:
-    """Count the samples known in both arrays (axis, ..., sample), and the equal ones."""
-    is_known = np.isfinite(held) & np.isfinite(new)
-    has_values = is_known.any(axis=0)
-    same = (np.isclose(held, new, rtol=1e-6, atol=0.0) | ~is_known).all(axis=0) & has_values
-    return has_values.sum(axis=-1), same.sum(axis=-1)
-
-
-def is_copy(common: int, same: int) -> bool:
-    """Return whether so many equal samples among those in common show a copy."""
-    return common >= 2 and same >= MIN_ALIKE_SHARE * common
-
-
-@dataclass(frozen=True)
-class _Match:
-    """Samples compared in two logs, samples that are equal, and displacement of the later log."""
-
-    common: int
-    same: int
-    shift: int
-
-    @property
-    def alike(self) -> bool:
-        return is_copy(self.common, self.same)
-
-
-def _find_shift(held: NDArray[np.float64], new: NDArray[np.float64]) -> _Match:
-    """Compare `new` at every shift with `held`, which has a margin of `MAX_SHIFT_SAMPLES`."""
-    size = new.shape[1]
-    unshifted = _Match(*count_alike(held[:, MAX_SHIFT_SAMPLES : MAX_SHIFT_SAMPLES + size], new), 0)
-    if unshifted.alike or unshifted.common < _MIN_COMMON_SAMPLES:
-        return unshifted
-    probe = np.flatnonzero(np.isfinite(new).any(axis=0))[:_PROBED_SAMPLES]
-    shifts = np.array(sorted(range(-MAX_SHIFT_SAMPLES, MAX_SHIFT_SAMPLES + 1), key=abs))
-    common, same = count_alike(
-        held[:, MAX_SHIFT_SAMPLES + shifts[:, None] + probe], new[:, None, probe]
-    )
-    for shift in shifts[
-        (common >= _MIN_COMMON_SAMPLES) & (same >= MIN_ALIKE_SHARE * common)
-    ].tolist():
-        shifted = _Match(
-            *count_alike(
-                held[:, MAX_SHIFT_SAMPLES + shift : MAX_SHIFT_SAMPLES + shift + size], new
-            ),
-            shift,
-        )
-        if shifted.alike and shifted.common >= _MIN_COMMON_SAMPLES:
-            return shifted
-    return unshifted
-
-
-def _match_logs(held: Source, new: Source, lag: int) -> _Match:
+def _match_logs(held: Source, new: Source, lag: int) -> Match:
     """Compare both ends of the overlap by the clock: `new` begins at sample `lag` of `held`."""
     axes = [axis for axis in held.axes if axis in new.axes]
     low, high = max(lag, 0), min(lag + new.size, held.size)
-    ends = [(low, min(high, low + _COMPARED_SAMPLES)), (max(low, high - _COMPARED_SAMPLES), high)]
+    ends = [(low, min(high, low + COMPARED_SAMPLES)), (max(low, high - COMPARED_SAMPLES), high)]
     rows_held, rows_new = ([source.axes.index(axis) for axis in axes] for source in (held, new))
-    matches: list[_Match] = []
-    for begin, end in dict.fromkeys(ends) if axes and high > low else ():
-        if (
-            matches
-            and matches[0].common >= _COMPARED_SAMPLES // 2
-            and matches[0].same < 0.5 * matches[0].common
-        ):
-            break  # not a copy, whatever its end
-        ours = read_log_slice(held, begin - MAX_SHIFT_SAMPLES, end + MAX_SHIFT_SAMPLES)
-        theirs = read_log_slice(new, begin - lag, end - lag)
-        matches.append(_find_shift(ours[rows_held], theirs[rows_new]))
-    surest = max(matches, key=lambda match: (match.alike, match.same), default=_Match(0, 0, 0))
-    return _Match(
-        sum(match.common for match in matches), sum(match.same for match in matches), surest.shift
+    return match_ends(
+        (
+            read_log_slice(held, begin - MAX_SHIFT_SAMPLES, end + MAX_SHIFT_SAMPLES)[rows_held],
+            read_log_slice(new, begin - lag, end - lag)[rows_new],
+        )
+        for begin, end in (dict.fromkeys(ends) if axes and high > low else ())
     )
 
 
@@ -162,13 +96,13 @@ def _first_notes(notes: Sequence[str], subject: str) -> list[str]:
 
 def _place_next(
     pieces: list[PlacedLog], source: Source, rate: float, max_gap: float
-) -> tuple[PlacedLog, tuple[PlacedLog, _Match] | None]:
+) -> tuple[PlacedLog, tuple[PlacedLog, Match] | None]:
     """Place the next log on the grid; also return the log that it overlaps, if any."""
     ratio = rate / source.rate
     if not pieces:
         return PlacedLog(source, runs_of(0, 0.0, source.size, ratio), 0.0, (source.start, 0)), None
-    differing: tuple[PlacedLog, _Match] | None = None
-    silent: tuple[PlacedLog, _Match] | None = None
+    differing: tuple[PlacedLog, Match] | None = None
+    silent: tuple[PlacedLog, Match] | None = None
     for held in reversed(pieces):
         if held.source.end < source.start or not set(held.source.axes) & set(source.axes):
             continue  # other axes over the same time do not overlap
@@ -233,7 +167,7 @@ def _grid_notes(pieces: Sequence[PlacedLog], rate: float) -> list[str]:
     return notes
 
 
-def _overlap_note(piece: PlacedLog, held: PlacedLog, match: _Match, rate: float) -> str:
+def _overlap_note(piece: PlacedLog, held: PlacedLog, match: Match, rate: float) -> str:
     name, holder = piece.source.name, held.source.name
     first, end = max(piece.first, held.first), min(piece.end, held.end)
     if not match.alike:

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.stamps import read_stamps
-from gyrostab.ingest.concat.place import is_copy
+from gyrostab.ingest.concat.copies import Match, count_alike
 from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS
@@ -78,16 +78,12 @@ def _count_repeated(raw: xr.Dataset, name: str, source: int, row: int) -> int:
         left, right = (
             read_slice(raw[name].data, first + begin, first + length) for first in (source, row)
         )
-        is_known = np.isfinite(left) & np.isfinite(right)
-        rows = is_known.any(axis=0)
-        compared += int(rows.sum())
-        same += int(((left == right) | ~is_known).all(axis=0)[rows].sum())
-        changes = changes or bool(
-            ((np.diff(left, axis=1) != 0) & is_known[:, 1:] & is_known[:, :-1]).any()
-        )
+        known, equal_rows = count_alike(left, right)
+        compared, same = compared + int(known), same + int(equal_rows)
+        changes = changes or bool((np.abs(np.diff(left, axis=1)) > 0).any())
         if differ.any() or same < _MIN_SAME_SHARE * compared:
             break
-    return length if changes and is_copy(compared, same) else 0
+    return length if changes and Match(compared, same).alike else 0
 
 
 def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int64]) -> Placement:
