@@ -157,12 +157,13 @@ def test_rows_that_two_files_hold_count_once(
     assert len(raw.attrs["row_start"]) == len(raw.attrs["source_files"])
 
 
-def test_a_copy_in_another_unit_and_with_damage_is_a_copy(
-    tmp_path: Path, values: np.ndarray
+@pytest.mark.parametrize("digits", [12, 3])
+def test_a_copy_in_another_unit_with_fewer_digits_and_damage_is_a_copy(
+    tmp_path: Path, values: np.ndarray, digits: int
 ) -> None:
     first = write(tmp_path / "a.csv", HEADER + _rows(values, slice(None)))
     rows = "".join(
-        f"{n * 1000},{'****' if n == 7 else f'{value / 3600:.12g}'}\n"
+        f"{n * 1000},{'****' if n == 7 else f'{value / 3600:.{digits}g}'}\n"
         for n, value in enumerate(np.round(values, 3))
     )
     second = write(tmp_path / "b.csv", "time [ms],gyro_x [deg/s]\n" + rows)
