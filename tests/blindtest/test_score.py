@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 import math
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
 
 from gyrostab.blindtest.generator.catalogue import AMBIGUITY, CATALOGUE, merge_ambiguous
 from gyrostab.blindtest.scoring.curves import (
@@ -23,7 +21,6 @@ from gyrostab.blindtest.scoring.injections import injection_differences, injecti
 from gyrostab.blindtest.scoring.proportions import median, share, spread, wilson
 from gyrostab.blindtest.scoring.score import intersection_over_union, score_case
 from gyrostab.blindtest.scoring.table import list_missed, markdown, score_table
-from gyrostab.errors import SchemaError
 
 
 def moment(second: float) -> str:
@@ -641,13 +638,6 @@ def test_share_of_repeated_rows_without_a_flag_has_the_interval_of_the_records()
     assert (line["n"], line["low"], line["high"]) == (100, *wilson(0, 20))
 
 
-@given(st.integers(0, 60), st.integers(1, 60))
-def test_wilson_matches_scipy(hits, total):
-    hits = min(hits, total)
-    expected = stats.binomtest(hits, total).proportion_ci(method="wilson")
-    np.testing.assert_allclose(wilson(hits, total), (expected.low, expected.high), atol=1e-6)
-
-
 @given(
     st.lists(st.tuples(st.integers(0, 300), st.integers(1, 60)), min_size=1, max_size=4),
     st.integers(-200, 200),
@@ -676,13 +666,6 @@ def test_ambiguity_sets_are_symmetric_and_cover_the_catalogue():
         "rate_quantization",
     }
     assert set(CATALOGUE) <= contract
-
-
-def test_invalid_diagnosis_is_refused():
-    broken = copy.deepcopy(diagnosis())
-    del broken["verdict"]
-    with pytest.raises(SchemaError, match="has no 'verdict'"):
-        score_case(broken, truth("shupe"))
 
 
 def test_identification_without_evidence_comes_last():

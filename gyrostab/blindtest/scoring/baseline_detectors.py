@@ -24,6 +24,7 @@ RANDOM = "random number"
 _LONG_RECORD_SAMPLES = 50_000
 _BLOCK_SAMPLES = 32
 _PART_SAMPLES = 20_000
+_BLOCK_S = 10.0  # length of the blocks that are correlated with channels [s]
 
 
 def octaves(size: int) -> list[int]:
@@ -41,26 +42,10 @@ def octaves(size: int) -> list[int]:
 def allan_variance(
     values: Array, factors: list[int], *, counts: NDArray[np.int64] | None = None
 ) -> Array:
-    """Compute the overlapping Allan variance of rates with NaN; clusters must be half full.
+    """Compute the overlapping Allan variance [(deg/h)2] of rates (time,) with NaN.
 
-    Parameters
-    ----------
-    values : ndarray, shape (time,)
-        Rates [deg/h].
-    factors : list of int
-        Averaging times [samples].
-    counts : ndarray of int, shape (time,), optional
-        Number of samples in each value, where the values are means.
-
-    Returns
-    -------
-    ndarray, shape (factor,)
-        Allan variance [(deg/h)2]; NaN where no pair of clusters is half full.
-
-    Examples
-    --------
-    >>> allan_variance(np.tile([1.0, -1.0], 500), [1, 2]).tolist()
-    [2.0, 0.0]
+    Averaging times are `factors` [samples]. Clusters must be half full; the variance is NaN where
+    no pair is. If the values are means, `counts` are their numbers of samples.
     """
     present = np.isfinite(values)
     weight = present.astype(np.int64) if counts is None else counts * present
@@ -171,24 +156,11 @@ def allan_band(
     nulls: int = 60,
     flicker: str = "spectrum",
 ) -> dict[str, Any]:
-    """Compute the 99 % band of the log Allan variance of noise alone with these gaps.
+    """Compute the 99 % band of the log Allan variance of noise alone with missing samples (time,).
 
-    Parameters
-    ----------
-    noise : dict
-        True N, B, K, Q of the axis.
-    rate : float
-        Rate [Hz].
-    missing : ndarray of bool, shape (time,)
-        Missing samples.
-    flicker : str
-        Method of `floor.flicker`.
-
-    Returns
-    -------
-    dict
-        ``keep`` (`octaves` with a variance), ``mean`` and ``sd`` of the log variance there, and
-        ``limit``, the 99 % quantile of the largest ``abs(z)``.
+    `noise` holds the true N, B, K, Q of the axis, and `flicker` is the method of `floor.flicker`.
+    Return ``keep`` (`octaves` with a variance), ``mean`` and ``sd`` of the log variance there, and
+    ``limit``, the 99 % quantile of the largest ``abs(z)``.
     """
     logs, scatter_of_whole = _draw_null_curves(rng, missing, noise, rate, flicker, nulls)
     keep = np.isfinite(logs).all(axis=0)
@@ -219,14 +191,8 @@ def allan_detector(
 ) -> float:
     """Compute how far the Allan deviation of any axis is outside its band of noise [sigma].
 
-    The true noise is known. Above 0, the record differs from noise at 1 %.
-
-    Parameters
-    ----------
-    record : ndarray, shape (axis, time)
-        Rates [deg/h], NaN where lost.
-    truth : dict
-        Truth of the case, which holds its noise.
+    The record (axis, time) [deg/h] is NaN where lost. Its true noise is known from the truth of the
+    case. Above 0, the record differs from noise at 1 %.
     """
     axes = len(truth["noise"])
     beyond = []
@@ -252,11 +218,7 @@ def _shared_limit(limit: float, axes: int) -> float:
 def block_series(log: xr.Dataset, length: int) -> tuple[Array, Array, NDArray[np.int64]]:
     """Compute block means and block log-variances (axis, block), and the samples present in each.
 
-    Parameters
-    ----------
-    length : int
-        Length of the blocks [samples]; an incomplete last one is left out. Blocks that are less
-        than a quarter full count as empty.
+    An incomplete last block is left out. Blocks that are less than a quarter full count as empty.
     """
     record = np.asarray(log["rate"].values)
     number = record.shape[1] // length
@@ -281,18 +243,13 @@ def channel_means(log: xr.Dataset, length: int, number: int) -> dict[str, Array]
     return out
 
 
-def channel_detector(log: xr.Dataset, *, block: float = 10.0) -> float:
+def channel_detector(log: xr.Dataset) -> float:
     """Compute how clearly block means or variances correlate with any channel [nats].
 
     Above 0, the smallest p-value of all pairs is below 1 % over their number. The blocks are
     assumed to be independent.
-
-    Parameters
-    ----------
-    block : float
-        Length of the blocks [s].
     """
-    length = round(block * float(log.attrs["sampling_rate_hz"]))
+    length = round(_BLOCK_S * float(log.attrs["sampling_rate_hz"]))
     means, powers, counts = block_series(log, length)
     pairs = [
         _correlation_p(series[present > 0], driver[present > 0])

@@ -32,20 +32,17 @@ _FITTED_LIMITS = (0.5, 1.0, CLEAR_STRENGTH, 2.0, SURE_STRENGTH, 5.0)
 def curves(rows: Sequence[Row]) -> pd.DataFrame:
     """Compute the shares detected and named against strength, by effect and for all effects.
 
-    For an effect out of catalogue, unidentified counts as named. Similar strengths count together.
-
-    Returns
-    -------
-    pandas.DataFrame
-        ``effect``, ``strength`` (the geometric mean), ``n``, ``detected``, ``detected_low``,
-        ``detected_high``, ``named``, ``named_low``, ``named_high``.
+    For an effect out of catalogue, unidentified counts as named. Similar strengths count together;
+    ``strength`` is their geometric mean.
     """
     groups = defaultdict(list)
     for row in rows:
-        if row["kind"] in (*CATALOGUE_KINDS, "out_of_catalogue") and row["effect"]:
-            groups[row["effect"], bisect(_EFFECT_LIMITS, row["strength"])].append(row)
-            if row["kind"] != "out_of_catalogue":
-                groups["all", bisect(_KNOWN_LIMITS, row["strength"])].append(row)
+        place = bisect(_EFFECT_LIMITS, row["strength"])
+        if row["kind"] == "out_of_catalogue":
+            groups[row["effect"], place].append({**row, "named": row["unidentified"]})
+        elif row["kind"] in CATALOGUE_KINDS:
+            groups[row["effect"], place].append(row)
+            groups["all", bisect(_KNOWN_LIMITS, row["strength"])].append(row)
     return pd.DataFrame(
         [
             {
@@ -59,13 +56,9 @@ def curves(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def fitted_noise_curve(rows: Sequence[Row]) -> pd.DataFrame:
-    """Compute the shares detected and named against strength in fitted noise.
+    """Compute the shares detected and named against ranges of strength in fitted noise.
 
-    Returns
-    -------
-    pandas.DataFrame
-        ``strength`` (range), ``n``, and the shares as in `curves`, of catalogue effects with an
-        undisturbed driver.
+    They are those of catalogue effects with an undisturbed driver.
     """
     selected = [
         (row, row["learned_strength"])
@@ -82,17 +75,8 @@ def fitted_noise_curve(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def _count_shares(part: Sequence[Row]) -> dict[str, Any]:
-    """Return the shares detected and named of some rows, with 95 % intervals."""
-    line: dict[str, Any] = {"n": len(part)}
-    for key in ("detected", "named"):
-        counted = [{"index": row["index"], key: row[_column_of(row, key)]} for row in part]
-        line |= share_columns(key, counted, key)
-    return line
-
-
-def _column_of(row: Row, key: str) -> str:
-    """Return the column that counts: an effect out of catalogue has no name to be given."""
-    return "unidentified" if key == "named" and row["kind"] == "out_of_catalogue" else key
+    """Return the shares detected and named of some rows, with the ends of 95 % intervals."""
+    return {"n": len(part), **share_columns(part, "detected"), **share_columns(part, "named")}
 
 
 def reliability(rows: Sequence[Row]) -> pd.DataFrame:
@@ -115,14 +99,9 @@ def reliability(rows: Sequence[Row]) -> pd.DataFrame:
 def rank_histogram(rows: Sequence[Row]) -> pd.DataFrame:
     """Count the ranks of the true parameters in the normal laws of their estimates.
 
-    The rank is the probability below the truth. Exact estimates have all ranks equally often;
-    standard errors that are too small give too many low and high ones.
-
-    Returns
-    -------
-    pandas.DataFrame
-        ``rank`` (range), ``n``, and ``low`` and ``high``, between which 95 % of the counts of exact
-        estimates are.
+    The rank is the probability below the truth. Exact estimates have all ranks equally often, and
+    95 % of the counts between ``low`` and ``high``; standard errors that are too small give too
+    many low and high ranks.
     """
     from scipy.stats import binom, norm
 
@@ -146,12 +125,8 @@ def rank_histogram(rows: Sequence[Row]) -> pd.DataFrame:
 def names_given(rows: Sequence[Row]) -> pd.DataFrame:
     """Count the strongest name of each record with a single effect.
 
-    Returns
-    -------
-    pandas.DataFrame
-        ``effect``, ``n``, and the counts of the right name (``itself``), of ``other names`` with
-        their counts in words, of records in which something was ``unidentified``, and in which
-        ``nothing`` was detected.
+    ``itself`` is the right name; in the other records there are ``other names``, something was
+    ``unidentified``, or ``nothing`` was detected.
     """
     out = []
     single = [row for row in rows if row["kind"] in ("single", "sub_threshold")]
@@ -179,13 +154,10 @@ def names_given(rows: Sequence[Row]) -> pd.DataFrame:
 def by_effect(rows: Sequence[Row]) -> pd.DataFrame:
     """Compute completeness and reliability of every effect of the catalogue.
 
-    Returns
-    -------
-    pandas.DataFrame
-        ``effect``; ``n`` of strength 1.5 or more, and the shares ``detected``, ``named`` (sets
-        merged) and ``exactly`` of these; the ``identifications`` of this name in all cases and the
-        share ``right``; the ``parameters`` that can be compared and the share ``covered`` by their
-        95 % intervals. None where there is nothing to count.
+    ``n`` cases have strength 1.5 or more; ``detected``, ``named`` (sets merged) and ``exactly`` are
+    shares of these. The ``identifications`` of this name, and the share ``right``, are of all
+    cases; of the ``parameters`` that can be compared, a share is ``covered`` by their 95 %
+    intervals. Shares are None where there is nothing to count.
     """
     identifications = {line["name"]: line for line in reliability(rows).to_dict("records")}
     selected = catalogue_rows(rows)

@@ -28,8 +28,8 @@ _GROUPS = {
 
 def _list_comparisons(
     rows: Sequence[Row],
-) -> list[tuple[str, str, list[Row], Array, NDArray[np.bool_]]]:
-    """List group of cases, detector, rows of noise and cases, their scores, and which are cases."""
+) -> list[tuple[dict[str, Any], list[Row], Array, NDArray[np.bool_]]]:
+    """List group and detector, records of noise and cases, their scores, and which are cases."""
     noise = answered_rows([row for row in rows if row["kind"] in ("null", "counterpart")])
     out = []
     for group, kinds in _GROUPS.items():
@@ -39,19 +39,11 @@ def _list_comparisons(
             continue
         records = [*noise, *cases]
         is_case = np.arange(len(records)) >= len(noise)
-        names = ["diagnosis", *cases[0]["baseline_detectors"]]
-        out += [(group, name, records, _read_scores(records, name), is_case) for name in names]
+        scores = [{"diagnosis": row["score"], **row["baseline_detectors"]} for row in records]
+        for name in ("diagnosis", *cases[0]["baseline_detectors"]):
+            line = {"cases": group, "detector": name}
+            out.append((line, records, np.array([row[name] for row in scores], float), is_case))
     return out
-
-
-def _read_scores(rows: Sequence[Row], detector: str) -> Array:
-    return np.array(
-        [
-            row["score"] if detector == "diagnosis" else row["baseline_detectors"][detector]
-            for row in rows
-        ],
-        dtype=float,
-    )
 
 
 def _share_detected(scores: Array, is_case: NDArray[np.bool_], rate: float) -> float:
@@ -66,12 +58,11 @@ def _share_detected(scores: Array, is_case: NDArray[np.bool_], rate: float) -> f
 def _share_columns(
     records: Sequence[Row], scores: Array, is_case: NDArray[np.bool_], rate: float
 ) -> dict[str, float]:
-    label = f"at {100 * rate:g} %"
-    low, high = resample(
-        records, lambda chosen: _share_detected(scores[chosen], is_case[chosen], rate)
-    )
-    value = _share_detected(scores, is_case, rate)
-    return {label: value, f"{label}, low": low, f"{label}, high": high}
+    def share(chosen: Any) -> float:
+        return _share_detected(scores[chosen], is_case[chosen], rate)
+
+    label, (low, high) = f"at {100 * rate:g} %", resample(records, share)
+    return {label: share(...), f"{label}, low": low, f"{label}, high": high}
 
 
 def detection_shares(rows: Sequence[Row]) -> pd.DataFrame:
@@ -79,22 +70,12 @@ def detection_shares(rows: Sequence[Row]) -> pd.DataFrame:
 
     The threshold of each detector is the score that this share of the null records and of the
     noise-only counterparts exceeds. A case counts if its strongest effect has strength 1.5 or more.
-
-    Returns
-    -------
-    pandas.DataFrame
-        ``detector``, ``cases`` (group), ``n``, ``noise`` (number of records), and for each rate the
-        share detected, with the 95 % interval of resampled records (a case and its counterpart
-        together). Empty without records of noise.
+    There are ``n`` cases and ``noise`` records of noise; without the latter the table is empty. The
+    95 % intervals are those of resampled records (a case and its counterpart together).
     """
     lines = []
-    for group, name, records, scores, is_case in _list_comparisons(rows):
-        line: dict[str, Any] = {
-            "cases": group,
-            "detector": name,
-            "n": int(is_case.sum()),
-            "noise": int((~is_case).sum()),
-        }
+    for line, records, scores, is_case in _list_comparisons(rows):
+        line |= {"n": int(is_case.sum()), "noise": int((~is_case).sum())}
         for rate in FALSE_ALARM_RATES:
             line |= _share_columns(records, scores, is_case, rate)
         lines.append(line)
@@ -102,22 +83,17 @@ def detection_shares(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def roc_curves(rows: Sequence[Row]) -> pd.DataFrame:
-    """Compute the shares of cases and of records of noise above each score.
+    """Compute the shares of cases (``detected``) and of noise (``false_alarms``) above each score.
 
-    Returns
-    -------
-    pandas.DataFrame
-        ``cases`` (group), ``detector``, ``false_alarms`` and ``detected`` (shares), and ``own``:
-        whether this is the threshold of the detector itself, which is score 0.
+    A line is the detector's ``own`` if the threshold is that of the detector itself, score 0.
     """
     lines = []
-    for group, name, _, scores, is_case in _list_comparisons(rows):
+    for line, _, scores, is_case in _list_comparisons(rows):
         noise, cases = scores[~is_case], scores[is_case]
         thresholds = [math.inf, *np.unique(noise)[::-1], -math.inf]
         lines += [
             {
-                "cases": group,
-                "detector": name,
+                **line,
                 "false_alarms": float((noise > threshold).mean()),
                 "detected": float((cases > threshold).mean()),
                 "own": is_own,
@@ -128,13 +104,7 @@ def roc_curves(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def counterpart_table(rows: Sequence[Row]) -> pd.DataFrame:
-    """Compare cases with their noise-only counterparts; empty without counterparts.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Lines as in `score_table`.
-    """
+    """Compare cases with their noise-only counterparts, in lines like those of `score_table`."""
     mine = answered_rows([row for row in rows if row["kind"] == "counterpart"])
     if not mine:
         return pd.DataFrame()

@@ -22,15 +22,11 @@ _NAMED_STRENGTH, _STRENGTH_TOLERANCE = 5.0, 1e-3
 def injection_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Compare the names found in the injected and reversed copies with those of the untouched one.
 
-    Returns
-    -------
-    list of dict
-        ``index``, ``recording``, ``effect``, ``failed`` (its diagnosis), ``strength``,
-        ``learned_strength`` (in fitted noise; None for truths without it); ``before``: names in the
-        untouched copy; ``there_before``: the effect's ambiguity set is among them; ``named``: it is
-        named in the injected copy; ``others``: other names added by the injection; ``flipped`` and
-        ``reversed``: names added by reversing sign or time, sets merged. Injections with a control
-        whose diagnosis failed are left out.
+    ``before`` are the names in the untouched copy, and ``there_before`` whether the effect's
+    ambiguity set is among them; ``named`` is whether it is named in the injected copy, ``others``
+    are other names added by the injection, and ``flipped`` and ``reversed`` names added by
+    reversing sign or time, sets merged. Injections with a control whose diagnosis failed are left
+    out.
     """
     groups: dict[Any, dict[str, Row]] = {}
     for row in rows:

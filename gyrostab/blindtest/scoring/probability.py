@@ -64,13 +64,10 @@ def expected_calibration_error(stated: Array, right: Array) -> float:
 
 
 def calibration_curve(rows: Sequence[Row]) -> pd.DataFrame:
-    """Compute the share of right names in groups of similar probability.
+    """Compute the share of names that are right, in groups of similar probability.
 
-    Returns
-    -------
-    pandas.DataFrame
-        ``stated`` (mean probability of the group), ``n``, ``right``, and ``low`` and ``high``,
-        the ends of its 95 % interval.
+    ``stated`` is the mean probability of the group; ``low`` and ``high`` are the ends of the 95 %
+    interval.
     """
     entries, stated, right = _collect_probabilities(rows)
     lines = []
@@ -93,12 +90,9 @@ def calibration_curve(rows: Sequence[Row]) -> pd.DataFrame:
 def risk_coverage(rows: Sequence[Row]) -> pd.DataFrame:
     """Compute the share of wrong names against the share of records named.
 
-    Returns
-    -------
-    pandas.DataFrame
-        One line for each probability, the largest first: ``least`` (this probability),
-        ``coverage`` (share of the records with effects that have a name at least as probable) and
-        ``risk`` (share of all such names that is wrong).
+    Each line, the largest probability first, has this ``least`` probability, the ``coverage``
+    (share of the records with effects that have a name at least as probable), and the ``risk``
+    (share of all such names that is wrong).
     """
     _, stated, right = _collect_probabilities(rows)
     thresholds = np.unique(stated)[::-1]

@@ -10,6 +10,7 @@ from importlib import resources
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 Line = dict[str, Any]
@@ -51,8 +52,6 @@ def wilson(hits: int, total: int) -> tuple[float, float]:
     >>> [round(limit, 4) for limit in wilson(0, 300)]
     [0.0, 0.0126]
     """
-    if total == 0:
-        return 0.0, 1.0
     from scipy.stats import binomtest
 
     interval = binomtest(hits, total).proportion_ci(0.95, "wilson")
@@ -61,12 +60,7 @@ def wilson(hits: int, total: int) -> tuple[float, float]:
 
 def _number_records(rows: Sequence[Row]) -> NDArray[np.intp]:
     """Number the records of rows; rows of one ``index`` are of one record."""
-    numbers: dict[Any, int] = {}
-    keys = [
-        ("no index", place) if row.get("index") is None else row["index"]
-        for place, row in enumerate(rows)
-    ]
-    return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.intp)
+    return np.asarray(pd.factorize(np.array([row["index"] for row in rows]))[0], dtype=np.intp)
 
 
 def resample(
@@ -74,13 +68,8 @@ def resample(
 ) -> tuple[float, float]:
     """Compute the 95 % interval of a statistic of rows, from resampled records.
 
-    Rows of one record are not independent, and are resampled together.
-
-    Parameters
-    ----------
-    rows : sequence of dict
-    statistic : callable
-        Computes a number from the positions of resampled rows.
+    Rows of one record are not independent, and are resampled together. The statistic computes a
+    number from the positions of resampled rows.
     """
     record = _number_records(rows)
     count = np.bincount(record)
@@ -107,17 +96,17 @@ def share_interval(rows: Sequence[Row], flags: Sequence[bool]) -> tuple[float, f
     hits, total = sum(flags), len(flags)
     records = len(set(_number_records(rows).tolist()))
     if records == total or hits in (0, total):
-        return wilson(records * hits // max(total, 1), records)
+        return wilson(records * hits // total, records)
     outcomes = np.array(flags)
     low, high = resample(rows, lambda chosen: float(outcomes[chosen].mean()))
     return max(0.0, low), min(1.0, high)
 
 
-def share_columns(key: str, rows: Sequence[Row], flag: str) -> dict[str, float]:
+def share_columns(rows: Sequence[Row], flag: str) -> dict[str, float]:
     """Make the columns of a share of rows and of the ends of its interval."""
     flags = [bool(row[flag]) for row in rows]
     low, high = share_interval(rows, flags)
-    return {key: sum(flags) / len(flags), f"{key}_low": low, f"{key}_high": high}
+    return {flag: sum(flags) / len(flags), f"{flag}_low": low, f"{flag}_high": high}
 
 
 def make_line(name: str, value: float, low: float, high: float, number: int, target: str) -> Line:
@@ -141,7 +130,7 @@ def share(name: str, rows: Sequence[Row], flag: str, target: str = "") -> Line:
     rows = [row for row in rows if row[flag] is not None]
     if not rows:
         return make_line(name, math.nan, math.nan, math.nan, 0, target)
-    value, low, high = share_columns("share", rows, flag).values()
+    value, low, high = share_columns(rows, flag).values()
     return make_line(name, value, low, high, len(rows), target)
 
 
@@ -183,8 +172,8 @@ def make_lines(table: str, groups: Mapping[str, Sequence[Row]]) -> list[Line]:
     )
     lines = []
     for figure in (figure for figure in figures if figure["table"] == table):
-        where, rows = figure["where"], groups[figure["rows"]]
-        rows = [row for row in rows if row[where]] if where else rows
+        where = figure["where"].split()
+        rows = [row for row in groups[figure["rows"]] if all(row[flag] for flag in where)]
         make = _STATISTICS[figure["statistic"]]
         lines.append(make(figure["quantity"], rows, figure["column"], figure["target"]))
     return lines

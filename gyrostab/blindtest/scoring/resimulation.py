@@ -42,24 +42,13 @@ _MIN_SCATTER = {"count": 0.5, "ramp": 1e-6, "levels": 0.02}
 def check_model(
     log: xr.Dataset, model: Mapping[str, Any], calibrated: Mapping[str, Mapping[str, float]]
 ) -> dict[str, Any]:
-    """Simulate the model of a diagnosis like its recording, and compare both.
+    """Simulate the model of a diagnosis like its recording, in memory, and compare both.
 
-    Parameters
-    ----------
-    log : xarray.Dataset
-        The recording, in memory.
-    model : mapping
-        Tables of the model with effects.
-    calibrated : mapping
-        Noise coefficients by axis, calibrated without the effects. The noise of the model lacks
-        what its effects add, and is easy to beat where they change the noise.
-
-    Returns
-    -------
-    dict
-        ``runs``: whether the model can be simulated; ``nats``: log-likelihood ratio of the
-        recording under the model with its effects over the more likely one of the model without
-        them and of the calibrated noise; or ``reason``.
+    The noise coefficients `calibrated`, by axis, are those without the effects. The noise of the
+    model lacks what its effects add, and is easy to beat where they change the noise. Return
+    ``runs``, whether the model can be simulated, and ``nats``, the log-likelihood ratio of the
+    recording under the model with its effects over the more likely one of the model without them
+    and of the calibrated noise; or ``reason``.
     """
     from gyrostab import read_model
 

@@ -12,12 +12,7 @@ import pandas as pd
 from gyrostab.blindtest.scoring.baseline_detectors import RANDOM
 from gyrostab.blindtest.scoring.probability import probability_lines
 from gyrostab.blindtest.scoring.proportions import Line, make_lines, median, share
-from gyrostab.blindtest.scoring.score import (
-    answered_rows,
-    catalogue_rows,
-    drawn_rows,
-    first_rows,
-)
+from gyrostab.blindtest.scoring.score import CATALOGUE_KINDS, drawn_rows, first_rows
 
 Row = Mapping[str, Any]
 
@@ -30,162 +25,119 @@ SURE_STRENGTH = 3.0
 
 
 def score_table(rows: Sequence[Row]) -> pd.DataFrame:
-    """Compute the figures of a benchmark with 95 % intervals and targets.
+    """Compute the figures of a benchmark with 95 % intervals and targets from its rows.
 
-    Parameters
-    ----------
-    rows : sequence of dict
-        All rows of `score_case`; counterparts are left to `counterpart_table`,
-        injections and their controls to `injection_table`.
-
-    Returns
-    -------
-    pandas.DataFrame
-        ``quantity``, ``value``, ``low``, ``high``, ``n``, ``target`` and ``state``: ``met`` where
-        the whole interval is in the target range, ``missed`` where the value is not, else ``not
-        shown``; empty without a target.
+    Counterparts are left to `counterpart_table`, injections and their controls to
+    `injection_table`. The ``state`` is ``met`` where the whole interval is in the target range,
+    ``missed`` where the value is not, else ``not shown``; it is empty without a target.
     """
-    rows = drawn_rows(rows)
-    groups = {**_effect_groups(rows), **_driver_groups(rows), **_evidence_groups(rows)}
+    levels = _make_levels(drawn_rows(rows))
     return pd.DataFrame(
         [
-            *make_lines("main", groups),
+            *make_lines("main", levels),
             *probability_lines(rows),
-            *make_lines("models", groups),
-            *_baseline_lines(rows),
+            *make_lines("models", levels),
+            *_baseline_lines(levels),
         ]
     )
 
 
-def _effect_groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Group the rows of records of noise, and of effects with an undisturbed driver."""
-    clear: list[Row] = [
-        {**row, "clear_in_fitted_noise": _fitted_strength(row) >= CLEAR_STRENGTH}
-        for row in catalogue_rows(rows, min_strength=CLEAR_STRENGTH)
+def _make_levels(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Make the rows of effects, cases and parameters, with the flags that ``figures.csv`` reads."""
+    effects: list[Row] = [{**row, **_flag_effect(row)} for row in rows]
+    clear, named, incomplete, unsure = (
+        {row["index"] for row in effects if bool(row[flag]) is value}
+        for flag, value in (("clear", True), ("named", True), ("named", False), ("sure", False))
+    )
+    cases: list[Row] = [
+        {
+            **row,
+            **_rate_evidence(row),
+            "has_clear": row["index"] in clear,
+            "has_name": row["index"] in named,
+            "all_named": row["index"] not in incomplete,
+            "nothing_else": not row["wrong"],
+            "sure_pair": row["kind"] == "pair" and row["index"] not in unsure,
+        }
+        for row in first_rows(effects)
     ]
-    catalogue = catalogue_rows(rows)
+    parameters: list[Row] = [
+        {
+            **row,
+            **entry,
+            "has_fitted_form": not row["form_differs"],
+            "is_not_shared": row["effect"] != "shared_source",
+            **{
+                f"within {level} %": None if entry["pull"] is None else abs(entry["pull"]) <= sigma
+                for level, sigma in _NORMAL_INTERVALS.items()
+            },
+        }
+        for row in effects
+        if row["clear"]
+        for entry in row["parameter_scores"]
+    ]
+    return {"effects": effects, "cases": cases, "parameters": parameters}
+
+
+def _flag_effect(row: Row) -> dict[str, bool]:
+    kind, fitted = row["kind"], float(row.get("learned_strength") or 0.0)
+    is_strong = row["strength"] >= CLEAR_STRENGTH
+    in_catalogue = kind in CATALOGUE_KINDS and bool(row["effect"])
+    is_lost = row["degradation"] in ("withheld", "substituted")
     return {
-        "null": answered_rows([row for row in rows if row["kind"] == "null"]),
-        "catalogue": catalogue,
-        "clear": clear,
-        "clear cases": answered_rows(first_rows(clear)),
-        "single": [row for row in clear if row["kind"] in ("single", "sub_threshold")],
-        "sub-threshold": [row for row in clear if row["kind"] == "sub_threshold"],
-        "multiple": [row for row in clear if row["kind"] in ("pair", "triple")],
-        "other form": [row for row in clear if row["form_differs"]],
-        "sure": [row for row in catalogue if _fitted_strength(row) >= SURE_STRENGTH],
-        "sure pairs": _sure_pairs(rows),
-        "out of catalogue": [
-            row
-            for row in rows
-            if row["kind"] == "out_of_catalogue" and row["strength"] >= CLEAR_STRENGTH
-        ],
+        "failed": bool(row.get("failed")),
+        "answered": not row.get("failed"),
+        "named": bool(row.get("named")),
+        "null": kind == "null",
+        "catalogue": in_catalogue,
+        "clear": in_catalogue and is_strong,
+        "clear_in_fitted_noise": fitted >= CLEAR_STRENGTH,
+        "sure": in_catalogue and fitted >= SURE_STRENGTH,
+        "single": kind in ("single", "sub_threshold"),
+        "sub_threshold": kind == "sub_threshold",
+        "multiple": kind in ("pair", "triple"),
+        "out_of_catalogue": kind == "out_of_catalogue" and is_strong,
+        "driver_lost": kind == "degraded_driver" and is_lost,
+        "driver_distorted": kind == "degraded_driver" and not is_lost,
     }
 
 
-def _fitted_strength(row: Row) -> float:
-    return float(row.get("learned_strength") or 0.0)
-
-
-def _sure_pairs(rows: Sequence[Row]) -> list[Row]:
-    """Return a row for each pair of strong effects, ``named`` if both are."""
-    pairs: dict[Any, list[Row]] = {}
-    for row in rows:
-        if row["kind"] == "pair":
-            pairs.setdefault(row["index"], []).append(row)
-    return [
-        {**pair[0], "named": all(row["named"] for row in pair)}
-        for pair in pairs.values()
-        if all(_fitted_strength(row) >= SURE_STRENGTH for row in pair)
-    ]
-
-
-def _driver_groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    groups: dict[str, list[Row]] = {"driver lost": [], "driver distorted": []}
-    for row in rows:
-        if row["kind"] == "degraded_driver":
-            is_lost = row["degradation"] in ("withheld", "substituted")
-            groups["driver lost" if is_lost else "driver distorted"].append(row)
-    return groups | {f"{name}, answered": answered_rows(part) for name, part in groups.items()}
-
-
-def _evidence_groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Group cases, those with a right name, their parameters, and the models of diagnoses."""
-    clear, cases = catalogue_rows(rows, min_strength=CLEAR_STRENGTH), first_rows(rows)
-    named_cases = {row["index"] for row in rows if row.get("named")}
-    incomplete = {row["index"] for row in rows if not row.get("named")}
+def _rate_evidence(row: Row) -> dict[str, Any]:
+    """Compare the evidence of a case with the oracle's, and its model with others; None without."""
+    check, learned = row.get("model_check"), row.get("learned", 0.0)
+    is_known = row["oracle"] > 0 and math.isfinite(row["gain"])
     return {
-        "cases": [{**row, "failed": bool(row.get("failed"))} for row in cases],
-        "parameters": [
-            {
-                **row,
-                **entry,
-                "has_fitted_form": not row["form_differs"],
-                "is_not_shared": row["effect"] != "shared_source",
-                **{
-                    f"within {level} %": None
-                    if entry["pull"] is None
-                    else abs(entry["pull"]) <= sigma
-                    for level, sigma in _NORMAL_INTERVALS.items()
-                },
-            }
-            for row in clear
-            for entry in row["parameter_scores"]
-        ],
-        "named cases": [
-            {
-                **row,
-                "relative": row["gain"] / row["oracle"],
-                "relative_fitted": row["gain"] / row["learned"]
-                if row.get("learned", 0.0) > 0
-                else None,
-                "enough": row["gain"] / row["oracle"] >= 0.7,
-                "all_named": not row["wrong"] and row["index"] not in incomplete,
-            }
-            for row in first_rows(clear)
-            if row["index"] in named_cases and row["oracle"] > 0 and math.isfinite(row["gain"])
-        ],
-        "models": [
-            {
-                **row,
-                "runs": check["runs"],
-                "nearer": check["runs"] and check["nats"] > 0.0,
-            }
-            for row in cases
-            if (check := row.get("model_check"))
-        ],
+        "relative": row["gain"] / row["oracle"] if is_known else None,
+        "relative_fitted": row["gain"] / learned if is_known and learned > 0 else None,
+        "enough": row["gain"] / row["oracle"] >= 0.7 if is_known else None,
+        "runs": check["runs"] if check else None,
+        "nearer": check["runs"] and check["nats"] > 0.0 if check else None,
     }
 
 
-def _baseline_lines(rows: Sequence[Row]) -> list[Line]:
+def _baseline_lines(levels: Mapping[str, Sequence[Row]]) -> list[Line]:
     """Make the lines of the baseline detectors and of the cost per case."""
-    nulls = [row for row in rows if row["kind"] == "null"]
-    clear = catalogue_rows(rows, min_strength=CLEAR_STRENGTH)
+    rows = levels["effects"]
     names = sorted({name for row in rows for name in row["baseline_detectors"]} - {RANDOM})
     lines = [
         share(
             label.format(name),
             [
-                {**row, "detected": row["baseline_detectors"][name] > 0.0}
-                for row in part
-                if name in row["baseline_detectors"]
+                {"index": row["index"], "detected": row["baseline_detectors"][name] > 0.0}
+                for row in rows
+                if row[flag] and name in row["baseline_detectors"]
             ],
             "detected",
         )
-        for label, part in (
-            ("detected by the {}, strength 1.5 or more", clear),
-            ("false alarms of the {}", nulls),
+        for label, flag in (
+            ("detected by the {}, strength 1.5 or more", "clear"),
+            ("false alarms of the {}", "null"),
         )
         for name in names
     ]
     for rate in sorted({row["rate"] for row in rows}):
-        lines.append(
-            median(
-                f"seconds per case at {rate:g} Hz, median",
-                [row for row in first_rows(rows) if row["rate"] == rate],
-                "seconds",
-            )
-        )
+        mine = [row for row in levels["cases"] if row["rate"] == rate]
+        lines.append(median(f"seconds per case at {rate:g} Hz, median", mine, "seconds"))
     return lines
 
 

@@ -17,18 +17,15 @@ Array = NDArray[np.float64]
 
 #: Separation d' below which an effect is invisible in a trace.
 MAX_SEPARATION = 0.1
+_NULLS = 50  # records of noise, for the band of the Allan plot
 
 
 def trace_visibility(scenario: Scenario, effect: Effect) -> dict[str, float]:
     """Compute the separation d' of samples and of 1 s means with and without an effect.
 
     For a mean, d' is its rms over the standard deviation of the noise; for a noise effect, the
-    change of the log variance over root 2. Both grow with the root of the samples averaged.
-
-    Returns
-    -------
-    dict
-        ``sample`` and ``second``, for the worst axis.
+    change of the log variance over root 2. Both grow with the root of the samples averaged, and are
+    those of the worst axis.
     """
     sample = second = 0.0
     every = max(1, round(scenario.rate))
@@ -59,15 +56,11 @@ def find_visibility(
     record: Array,
     *,
     rng: np.random.Generator,
-    nulls: int = 50,
 ) -> dict[str, Any]:
     """Test whether the effects of a record (axis, time) are sub-threshold.
 
-    Returns
-    -------
-    dict
-        ``sub_threshold``, ``sample`` and ``second`` (the largest d', see `trace_visibility`), and
-        ``allan`` (the largest deviation over its 99 % limit, per axis).
+    Return ``sub_threshold``, ``sample`` and ``second`` (the largest d', see `trace_visibility`),
+    and ``allan`` (the largest deviation over its 99 % limit, per axis).
     """
     visible = [trace_visibility(scenario, effect) for effect in effects]
     worst = {key: max((d[key] for d in visible), default=0.0) for key in ("sample", "second")}
@@ -83,7 +76,7 @@ def find_visibility(
             rate=scenario.rate,
             missing=np.isnan(row),
             rng=rng,
-            nulls=nulls,
+            nulls=_NULLS,
             flicker=scenario.flicker,
         )
         allan[axis] = band_excess(row, band) / band["limit"]
