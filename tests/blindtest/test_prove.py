@@ -18,10 +18,16 @@ import xarray as xr
 import gyrostab
 from gyrostab.blindtest.generator.record import make_log
 from gyrostab.blindtest.runner.benchmark import Proof
-from gyrostab.blindtest.runner.folder import FIRST_PUBLIC_SEED, begin_run, case_name, read_sums
+from gyrostab.blindtest.runner.folder import (
+    FIRST_PUBLIC_SEED,
+    begin_run,
+    case_name,
+    inspect_folder,
+    read_sums,
+)
 from gyrostab.blindtest.runner.outcome import _thin_out, page_text, score_rows
 from gyrostab.blindtest.runner.pool import run_in_processes
-from gyrostab.blindtest.runner.steps import diagnose_case, draw_case
+from gyrostab.blindtest.runner.steps import diagnose_case
 from gyrostab.blindtest.scenarios.plan import plan_case
 from gyrostab.blindtest.scenarios.real import RECORDINGS
 from gyrostab.blindtest.scoring.table import score_table
@@ -502,12 +508,7 @@ def damage_marker(folder: Path) -> None:
 
 
 def stop_while_drawing(folder: Path) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gyrostab.blindtest.scenarios.commitment.commit_case", os.remove)
-        patch.setattr(shutil, "rmtree", lambda *path, **options: None)  # the process was killed
-        with pytest.raises(TypeError):
-            draw_case(folder, case_name(1, 9), small_plans(1, seed=1)[0])
-    assert list(folder.glob(".*.part"))
+    (folder / "recordings" / f".{case_name(1, 9)}.nc.gyrostab-12345678.part").write_text("half")
 
 
 def stop_while_replacing(folder: Path) -> None:
@@ -518,7 +519,8 @@ def stop_while_replacing(folder: Path) -> None:
 
 
 def replace_run(folder: Path) -> None:
-    begin_run(folder, {}, {**core._DEFAULTS, "seed": 2}, resume=False, overwrite=True)
+    usual = {**core._DEFAULTS, "seed": 2}
+    begin_run(folder, inspect_folder(folder, {}, usual, resume=False, overwrite=True))
 
 
 def stop_at_table(path: Path) -> None:

@@ -133,17 +133,14 @@ def prove(
         raise OptionError(f"workers={workers}: give a number of processes, or 0 for this process")
     folder, stage, tell = resolve_link(directory), progress or no_stage, say or (lambda text: None)
     injected = 0 if real is None else (cases or _DEFAULTS["cases"]) // _CASES_PER_INJECTION
-    fresh = {
-        **_DEFAULTS,
-        "seed": FIRST_PUBLIC_SEED + secrets.randbelow(10**9),
-        "injected": injected,
-    }
+    new_seed = FIRST_PUBLIC_SEED + secrets.randbelow(10**9)
+    usual = {**_DEFAULTS, "seed": new_seed, "injected": injected}
     requested = {"cases": cases, "seed": seed, "nulls": nulls, "counterparts": counterparts}
-    previous, _ = inspect_folder(folder, requested, fresh, resume=resume, overwrite=overwrite)
-    if real is not None and (previous or fresh)["injected"]:
+    job = inspect_folder(folder, requested, usual, resume=resume, overwrite=overwrite)
+    if real is not None and job["injected"]:
         check_recordings(Path(real))
     with lock_job(folder):
-        job = begin_run(folder, requested, fresh, resume=resume, overwrite=overwrite)
+        begin_run(folder, job)
         tell(_describe_run(job, folder))
         plans = _plan_all(job)
 

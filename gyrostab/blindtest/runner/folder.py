@@ -89,21 +89,31 @@ def inspect_folder(
     *,
     resume: bool,
     overwrite: bool,
-) -> tuple[dict[str, Any] | None, dict[str, int]]:
-    """Find the run to continue (or None) and its options; see `begin_run`. Changes nothing."""
+) -> dict[str, Any]:
+    """Find the run to continue in a folder, or plan a new one. Changes nothing.
+
+    Options that are not `requested` (None) are the `usual` ones. Return the content of
+    ``benchmark.json``; that of a new run has no versions of the code yet. See
+    `gyrostab.prove` for the errors.
+    """
     previous = read_request(directory) if directory.is_dir() and (resume or not overwrite) else None
     check_target(
         directory,
         overwrite=True,
         find_foreign=find_foreign_file if previous is None else lambda _: None,
     )
+    given = {name: value for name, value in requested.items() if value is not None}
     if previous is None:
-        chosen = dict(usual) | {
-            name: value for name, value in requested.items() if value is not None
-        }
+        chosen = {**usual, **given}
         _check_request(chosen)
         _check_is_empty(directory, overwrite=overwrite)
-        return None, chosen
+        return {
+            "schema": _SCHEMA,
+            **chosen,
+            "code": [],
+            "begun": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
+            "machine": f"{platform.machine()}, Python {platform.python_version()}",
+        }
     if not resume:
         raise OutputError(
             f"{directory} holds a benchmark already: --resume continues it, "
@@ -111,79 +121,36 @@ def inspect_folder(
         )
     differences = [
         f"{name} {previous[name]}, not {value}"
-        for name, value in requested.items()
-        if value is not None and value != previous[name]
+        for name, value in given.items()
+        if value != previous[name]
     ]
     if differences:
         raise ResumeError(
             f"{directory}: was begun with {', '.join(differences)}; leave that out, "
             "or begin again with --overwrite"
         )
-    return previous, {name: previous[name] for name in requested}
+    return previous
 
 
-def begin_run(
-    directory: Path,
-    requested: Mapping[str, int | None],
-    usual: Mapping[str, int],
-    *,
-    resume: bool,
-    overwrite: bool,
-) -> dict[str, Any]:
-    """Create the folder, or continue the run in it.
-
-    Parameters
-    ----------
-    directory : pathlib.Path
-        Folder of the run; its parent must exist.
-    requested : mapping
-        ``cases``, ``seed``, ``nulls`` and ``counterparts`` as given, None where not given.
-    usual : mapping
-        Defaults; keys that are not in `requested` are stored as they are.
-
-    Returns
-    -------
-    dict
-        Content of ``benchmark.json``.
-
-    Raises
-    ------
-    OutputError
-        When the folder cannot be created, or is not empty.
-    OptionError
-        When a number is out of range.
-    ResumeError
-        When the run in the folder has other options.
-    """
-    previous, chosen = inspect_folder(
-        directory, requested, usual, resume=resume, overwrite=overwrite
-    )
-    state = fingerprint_code()
-    if previous is not None:
+def begin_run(directory: Path, job: dict[str, Any]) -> None:
+    """Create the folder of a run, or continue it; add the version of the code to its options."""
+    if job["code"]:
         # files of a run that was killed
         for leftover in (*directory.glob(".*.part"), *directory.glob("*/.*.part")):
             if is_leftover(leftover.name):
                 _remove_path(leftover)
-        if state != previous["code"][-1]:
-            previous["code"].append(state)
-            write_json(directory / "benchmark.json", previous)
-        return previous
-    directory.mkdir(exist_ok=True)
-    # benchmark.json last, as it shows that the rest may be replaced if this is interrupted
-    for item in sorted(directory.iterdir(), key=lambda item: item.name == "benchmark.json"):
-        if item.name != "lock":
-            _remove_path(item)
-    for name in _FOLDERS:
-        (directory / name).mkdir()
-    content = {
-        "schema": _SCHEMA,
-        **chosen,
-        "code": [state],
-        "begun": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
-        "machine": f"{platform.machine()}, Python {platform.python_version()}",
-    }
-    write_json(directory / "benchmark.json", content)
-    return content
+    else:
+        directory.mkdir(exist_ok=True)
+        # benchmark.json last, as it shows that the rest may be replaced if this is interrupted
+        for item in sorted(directory.iterdir(), key=lambda item: item.name == "benchmark.json"):
+            if item.name != "lock":
+                _remove_path(item)
+        for name in _FOLDERS:
+            (directory / name).mkdir()
+    state = fingerprint_code()
+    if job["code"][-1:] != [state]:
+        job["code"].append(state)
+        write_json(directory / "benchmark.json", job)
 
 
 def _remove_path(path: Path) -> None:

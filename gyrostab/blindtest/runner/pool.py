@@ -23,23 +23,10 @@ def run_in_processes(
     workers: int | None,
     report: Callable[[int], None] = lambda done: None,
 ) -> list[T]:
-    """Call `function` with each of `jobs`, and return the results in the order of the jobs.
+    """Call a module-level function with each of `jobs`; return the results in their order.
 
-    Parameters
-    ----------
-    function : callable
-        Module-level function.
-    jobs : sequence of tuple
-        Arguments of each call.
-    workers : int, optional
-        Number of processes (one per core by default); 0 to work in this process.
-    report : callable, optional
-        Receives the number of finished jobs.
-
-    Raises
-    ------
-    WorkerError
-        When a process dies.
+    There are as many processes as `workers`, by default one per core, and none for 0. `report`
+    receives the number of finished jobs. If a process dies, a `WorkerError` is raised.
 
     Examples
     --------

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,21 +27,12 @@ def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | Non
     truth = directory / "truth" / f"{name}.json"
     if truth.exists():  # written after the recording
         return fingerprint(truth.read_text(encoding="utf-8"))
-    part = directory / f".{name}.gyrostab-{name[:8]}.part"
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir()
-    try:
-        log, content = (
-            make_injection_case(plan, real)
-            if real is not None and "recording" in plan
-            else make_case(plan)
-        )
-        sha256 = commit_case(log, content, part, name=name)
-        os.replace(part / "recordings" / f"{name}.nc", directory / "recordings" / f"{name}.nc")
-        os.replace(part / "truth" / f"{name}.json", truth)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    return sha256
+    log, content = (
+        make_injection_case(plan, real)
+        if real is not None and "recording" in plan
+        else make_case(plan)
+    )
+    return commit_case(log, content, directory, name=name)
 
 
 def diagnose_case(recording: Path, target: Path, failed: Path, nulls: int) -> bool:

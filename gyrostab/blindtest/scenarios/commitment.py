@@ -12,6 +12,7 @@ import xarray as xr
 
 from gyrostab.blindtest.generator.scenario import stream
 from gyrostab.errors import FormatError
+from gyrostab.store.output import replace_file, write_text
 from gyrostab.units import on_disk
 
 
@@ -37,39 +38,17 @@ def _to_json_type(value: Any) -> Any:
 
 
 def fingerprint(text: str) -> str:
-    """Compute the SHA-256 of a committed text.
-
-    Examples
-    --------
-    >>> fingerprint("")[:8]
-    'e3b0c442'
-    """
+    """Compute the SHA-256 of a committed text."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def commit_case(log: xr.Dataset, truth: dict[str, Any], directory: str | Path, *, name: str) -> str:
-    """Write ``recordings/NAME.nc`` and ``truth/NAME.json``; return the SHA-256 of the latter.
+def commit_case(log: xr.Dataset, truth: dict[str, Any], directory: Path, *, name: str) -> str:
+    """Write ``recordings/NAME.nc``, then ``truth/NAME.json``; return the SHA-256 of the latter.
 
-    `gyrostab.read_log` reads the recording like any foreign NetCDF file.
-
-    Parameters
-    ----------
-    directory : path
-        Parent of both folders.
-    name : str
-        Stem of the files; it must not reveal the content.
-
-    Returns
-    -------
-    str
-        SHA-256 to publish before the recording is diagnosed.
+    `gyrostab.read_log` reads the recording like any foreign NetCDF file. The name must not reveal
+    the content, and the SHA-256 is to be published before the recording is diagnosed.
     """
-    base = Path(directory)
-    for folder in ("recordings", "truth"):
-        (base / folder).mkdir(parents=True, exist_ok=True)
-    text = truth_text(truth)
-    (base / "truth" / f"{name}.json").write_text(text, encoding="utf-8")
-    handed = log.copy()
+    text, handed = truth_text(truth), log.copy()
     for variable in handed.variables.values():
         if "units" in variable.attrs:
             variable.attrs = {**variable.attrs, "units": on_disk(variable.attrs["units"])}
@@ -79,32 +58,17 @@ def commit_case(log: xr.Dataset, truth: dict[str, Any], directory: str | Path, *
     packing |= {
         str(key): {"dtype": "int64", "units": "nanoseconds since 1970-01-01"}
         for key in handed.variables
-        if _is_time(handed, key)
+        if np.issubdtype(handed[key].dtype, np.datetime64)
     }
-    handed.to_netcdf(base / "recordings" / f"{name}.nc", engine="netcdf4", encoding=packing)
+    with replace_file(directory / "recordings" / f"{name}.nc") as temporary:
+        handed.to_netcdf(temporary, engine="netcdf4", encoding=packing)
+    write_text(directory / "truth" / f"{name}.json", text)
     return fingerprint(text)
 
 
-def _is_time(log: xr.Dataset, key: Any) -> bool:
-    return bool(np.issubdtype(log[key].dtype, np.datetime64))
-
-
-def open_truth(path: str | Path, *, sha256: str) -> dict[str, Any]:
-    """Read a committed truth.
-
-    Parameters
-    ----------
-    path : path
-        File in the folder ``truth``.
-    sha256 : str
-        Hash from `commit_case`.
-
-    Raises
-    ------
-    FormatError
-        When the file is not the one that was committed.
-    """
-    text = Path(path).read_text(encoding="utf-8")
+def open_truth(path: Path, *, sha256: str) -> dict[str, Any]:
+    """Read a truth; raise `FormatError` unless it is the one that was committed as `sha256`."""
+    text = path.read_text(encoding="utf-8")
     if fingerprint(text) != sha256:
         raise FormatError(
             f"{path}: the truth was changed after it was committed "

@@ -9,7 +9,6 @@ import numpy as np
 
 from gyrostab.blindtest.generator.catalogue import CATALOGUE, OUT_OF_CATALOGUE
 from gyrostab.blindtest.generator.scenario import stream
-from gyrostab.errors import OptionError
 
 #: Kind of case -> its number in 20 cases. "single", "sub_threshold", "out_of_catalogue" and
 #: "degraded_driver" hold one effect.
@@ -90,35 +89,11 @@ def _draw_shape(rng: np.random.Generator, kind: str, index: int) -> tuple[float,
 
 
 def plan_case(index: int, *, seed: int) -> dict[str, Any]:
-    """Plan one case; the plan depends on index and seed only.
+    """Plan case `index` of a benchmark, from 0; the plan depends on index and seed only.
 
-    Parameters
-    ----------
-    index : int
-        Number of the case, from 0.
-    seed : int
-        Seed of the whole benchmark.
-
-    Returns
-    -------
-    dict
-        ``index``, ``seed``, ``kind``, ``names``, ``strengths``, ``in_fitted_noise`` (whether the
-        strengths are), ``rate`` [Hz], ``seconds``, ``gaps`` (share), ``cuts``, ``heavy``,
-        ``degradation``.
-
-    Raises
-    ------
-    OptionError
-        When the index is negative.
-
-    Examples
-    --------
-    >>> kinds = [plan_case(i, seed=1)["kind"] for i in range(40)]
-    >>> kinds.count("null")
-    4
+    ``in_fitted_noise`` is set if the strengths are; see `draw_scenario` for ``rate`` [Hz],
+    ``seconds``, ``gaps``, ``cuts`` and ``heavy``, and `degrade_driver` for ``degradation``.
     """
-    if index < 0:
-        raise OptionError(f"index={index}: cases are counted from 0")
     deck = [kind for kind, number in KINDS.items() for _ in range(number)]
     lap, place = divmod(index, len(deck))
     order = stream(seed, "kinds", lap).permutation(len(deck))
@@ -163,13 +138,7 @@ def plan_case(index: int, *, seed: int) -> dict[str, Any]:
 
 
 def plan_cases(number: int, *, seed: int) -> list[dict[str, Any]]:
-    """Plan the first `number` cases of a benchmark.
-
-    Examples
-    --------
-    >>> len(plan_cases(5, seed=3))
-    5
-    """
+    """Plan the first `number` cases of a benchmark."""
     return [plan_case(index, seed=seed) for index in range(number)]
 
 
