@@ -108,34 +108,10 @@ def draw_effects(plan: dict[str, Any], scenario: Scenario, *, attempt: int = 0) 
 def make_case(plan: dict[str, Any]) -> tuple[xr.Dataset, dict[str, Any]]:
     """Make the log and the truth of a plan (see `gyrostab.blindtest.scenarios.plan.plan_case`).
 
-    Parameters
-    ----------
-    plan : dict
-        From `plan_case`; a hand-written one may name any effect of the catalogue. With ``copy``
-        of `plan_counterparts`, the effects are left out of the record: noise, missing samples,
-        channels and quantization are those of the case.
-
-    Returns
-    -------
-    log : xarray.Dataset
-        Log without any information about the truth.
-    truth : dict
-        JSON-ready: ``effects`` with names, axes, intervals, averaging times, sizes, expected
-        evidence and mean waveforms, ``noise`` and more.
-
-    Raises
-    ------
-    OptionError
-        When a name is unknown, or a sub-threshold case cannot be drawn.
-
-    Examples
-    --------
-    >>> from gyrostab.blindtest.scenarios.plan import plan_case
-    >>> plan = plan_case(0, seed=5) | {"rate": 10.0, "seconds": 600, "kind": "single"}
-    >>> plan |= {"names": ["ageing_noise"], "strengths": [4.0], "in_fitted_noise": False}
-    >>> log, truth = make_case(plan)
-    >>> truth["effects"][0]["name"], log.sizes["time"]
-    ('ageing_noise', 6000)
+    A hand-written plan may name any effect of the catalogue; an unknown one, or a sub-threshold
+    case that cannot be drawn, is an `OptionError`. With ``copy`` of `plan_counterparts`, the
+    effects are left out of the record: noise, missing samples, channels and quantization are those
+    of the case. The log has no information about the truth, which is ready for JSON.
     """
     catalogue = CATALOGUE | OUT_OF_CATALOGUE
     unknown = [name for name in plan["names"] if name not in catalogue]

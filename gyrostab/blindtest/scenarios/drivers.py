@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.errors import OptionError
-
 Array = NDArray[np.float64]
 Channels = dict[str, tuple[Array, float]]
 
@@ -28,24 +26,11 @@ def _make_substitute(driver: str, values: Array, rng: np.random.Generator) -> tu
 def degrade_driver(
     channels: Channels, driver: str, *, how: str, rng: np.random.Generator
 ) -> Channels:
-    """Degrade the driver of an effect.
+    """Degrade the channel that drives an effect.
 
-    Parameters
-    ----------
-    channels : dict
-        Name to values and rate [Hz].
-    driver : str
-        Channel that drives the effect.
-    how : str
-        One of "withheld", "substituted", "lagged", "confounded", "noisy" and "clipped":
-        left out; replaced by a similar channel with other times; delayed by 30 to 180 s;
-        accompanied by another channel that moves with it; with noise of its standard deviation;
-        clipped at the middle of its range.
-
-    Raises
-    ------
-    OptionError
-        When `how` is unknown.
+    It is "withheld", "substituted" by a similar channel with other times, "lagged" by 30 to 180 s,
+    "confounded" with another channel that moves with it, "noisy" by its standard deviation, or
+    "clipped" at the middle of its range.
 
     Examples
     --------
@@ -79,11 +64,6 @@ def degrade_driver(
         remaining[name] = (like, rate)
     elif how == "noisy":
         remaining[driver] = (values + rng.normal(0.0, float(values.std()), values.size), rate)
-    elif how == "clipped":
+    else:  # clipped
         remaining[driver] = (np.minimum(values, 0.5 * (values.min() + values.max())), rate)
-    else:
-        raise OptionError(
-            f"how={how!r}: give 'withheld', 'substituted', 'lagged', 'confounded', 'noisy' "
-            "or 'clipped'"
-        )
     return remaining

@@ -27,7 +27,6 @@ from gyrostab.blindtest.generator.scenario import (
 from gyrostab.blindtest.scenarios.case import describe_truth
 from gyrostab.blindtest.scoring.baseline_detectors import allan_variance, octaves
 from gyrostab.errors import OptionError
-from gyrostab.schema import check_log, signal_name
 from gyrostab.time.grid import first_stamp
 
 Array = NDArray[np.float64]
@@ -63,13 +62,13 @@ def estimate_noise(record: Array, *, rate: float) -> dict[str, float]:
 def _draw_around_log(
     log: xr.Dataset, record: Array, measured: MeasuredNoise, rng: np.random.Generator
 ) -> Scenario:
-    """Draw a scenario with the length, gaps, noise and temperature of a real log."""
+    """Draw a scenario with the length, gaps and noise of a real log."""
     rate = float(log.attrs["sampling_rate_hz"])
     scenario = draw_scenario(rng, rate=rate, seconds=record.shape[1] / rate, cuts=0)
     noise = [estimate_noise(row, rate=rate) for row in record]
     noise += [noise[0]] * (3 - len(noise))
     gone = np.asarray(np.isnan(record).any(axis=0))
-    scenario = replace(
+    return replace(
         scenario,
         size=record.shape[1],
         start=first_stamp(log),
@@ -77,12 +76,6 @@ def _draw_around_log(
         missing=gone,
         measured=measured,
     )
-    if "temperature" in log and np.isfinite(log["temperature"].values).mean() > 0.9:
-        values = np.asarray(log["temperature"].values, dtype=float)
-        at = np.linspace(0, values.size - 1, scenario.temperature.size)
-        good = np.flatnonzero(np.isfinite(values))
-        scenario = replace(scenario, temperature=np.interp(at, good, values[good]))
-    return scenario
 
 
 def _compute_addition(scenario: Scenario, effect: Effect, rng: np.random.Generator) -> Array:
@@ -156,59 +149,25 @@ def _quantize_like(record: Array, values: Array, dither: Array) -> Array:
 def inject_effect(
     log: xr.Dataset, effect: str, strength: float, rng: np.random.Generator
 ) -> dict[str, tuple[xr.Dataset, dict[str, Any]]]:
-    """Inject an effect into a real log, and make the controls.
+    """Inject an effect into a real log of rates without channels, and make the controls.
 
-    Parameters
-    ----------
-    log : xarray.Dataset
-        Real log of rates.
-    effect : str
-        Name in the catalogue.
-    strength : float
-        Size in units of the limit in fitted noise, for the noise of this log as measured by
-        `gyrostab.blindtest.generator.measured_noise`.
-
-    Returns
-    -------
-    dict
-        Log and truth of each copy: ``injected``, and the controls ``untouched``, ``flipped`` (in
-        sign) and ``reversed`` (in time). All have the same channels.
-
-    Raises
-    ------
-    OptionError
-        When the effect is unknown, or needs restarts or axes that the log does not have.
-
-    Examples
-    --------
-    >>> from gyrostab.blindtest.scenarios.case import make_case
-    >>> from gyrostab.blindtest.scenarios.plan import plan_case
-    >>> null = {"kind": "null", "names": [], "strengths": [], "degradation": None}
-    >>> log, _ = make_case(plan_case(0, seed=5) | null | {"rate": 10.0, "seconds": 600})
-    >>> sorted(inject_effect(log, "spectral_line", 4.0, np.random.default_rng(0)))
-    ['flipped', 'injected', 'reversed', 'untouched']
+    `strength` is the size in units of the limit in fitted noise, for the noise of this log as
+    measured by `gyrostab.blindtest.generator.measured_noise`. Return log and truth of each copy:
+    ``injected``, and the controls ``untouched``, ``flipped`` (in sign) and ``reversed`` (in time).
+    All have the same channels. An effect must not follow restarts; one that needs axes that the log
+    does not have is an `OptionError`.
     """
-    check_log(log)
-    if effect not in CATALOGUE:
-        raise OptionError(f"{effect!r} is not in the catalogue; it has {', '.join(CATALOGUE)}")
-    if signal_name(log) != "rate":
-        raise OptionError("an injection needs a log of rates; this one holds angles")
     record = np.asarray(log["rate"].values[:3], dtype=float)
     axes = [str(name) for name in log["axis"].values[:3]]
     scenario, made = _draw_effect(log, record, effect, strength, rng)
     total = record + _compute_addition(scenario, made, rng)[: len(axes)]
     injected = _quantize_like(record, total, rng.random(record.shape))
     if made.after is not None:
-        padded = np.concatenate([injected, np.zeros((3 - len(axes), scenario.size))])
-        changed = made.after(padded)[: len(axes)]
+        changed = made.after(injected)
         to_nearest = _quantize_like(record, changed, np.full(record.shape, 0.5))
         injected = np.where(changed == injected, injected, to_nearest)
         injected[np.isnan(record)] = np.nan
-    channels = {
-        name: channel
-        for name, channel in make_channels(scenario, [made], rng).items()
-        if name not in log.variables
-    }
+    channels = make_channels(scenario, [made], rng)
     names = dict(zip(AXES, axes, strict=False))
     truth, control_truth = (
         _rename_axes(describe_truth(scenario, effects), names) for effects in ([made], [])
@@ -257,10 +216,6 @@ def _draw_effect(
     log: xr.Dataset, record: Array, effect: str, strength: float, rng: np.random.Generator
 ) -> tuple[Scenario, Effect]:
     entry = CATALOGUE[effect]
-    if entry.cuts:
-        raise OptionError(
-            f"{effect} follows restarts, which cannot be injected; inject another effect"
-        )
     present = set("xyz"[: record.shape[0]])
     measured = measure_noise(record, rate=float(log.attrs["sampling_rate_hz"]), axes=3)
     for _ in range(_MAX_TRIES):
@@ -268,7 +223,7 @@ def _draw_effect(
         if entry.needs == "rotation" and scenario.rotation.max() == 0:
             continue
         made = entry.make(scenario, rng, strength=strength, in_fitted_noise=True)
-        if set(made.axes) <= present or (len(made.axes) == 3 and made.after is not None):
+        if set(made.axes) <= present:
             return scenario, made
     raise OptionError(
         f"{effect} needs more axes than the {record.shape[0]} of this log; inject another effect"

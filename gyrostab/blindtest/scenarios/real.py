@@ -132,20 +132,7 @@ def _read_piece(recording: str, folder: Path, part: float) -> xr.Dataset:
 
 
 def make_injection_case(plan: dict[str, Any], folder: Path) -> tuple[xr.Dataset, dict[str, Any]]:
-    """Make one of the four logs of an injection, and its truth.
-
-    Parameters
-    ----------
-    plan : dict
-        Plan from `plan_injections`.
-    folder : pathlib.Path
-        Folder of the real recordings.
-
-    Raises
-    ------
-    FormatError
-        When the recording does not exist.
-    """
+    """Make one of the four logs of an injection into a recording of a folder, and its truth."""
     log = _read_piece(plan["recording"], folder, plan["part"])
     rng = np.random.default_rng(stream(plan["seed"], "injection", plan["index"]).integers(2**40))
     made, truth = inject_effect(log, plan["effect"], plan["strength"], rng)[plan["copy"]]
