@@ -15,13 +15,7 @@ LENGTH = 500.0
 
 
 def diffusion_time(thickness: float, diffusivity: float) -> float:
-    """Compute the slowest time constant [s] of a slab of `thickness` [m] insulated on one face.
-
-    Examples
-    --------
-    >>> round(diffusion_time(0.012, 2.2e-7))
-    265
-    """
+    """Compute the slowest time constant [s] of a slab of `thickness` [m] insulated on one face."""
     return 4.0 * thickness**2 / (math.pi**2 * diffusivity)
 
 
@@ -48,31 +42,10 @@ def layer_temperatures(
     thickness: float = 0.012,
     diffusivity: float = 2.2e-7,
 ) -> Array:
-    """Compute the temperature of every layer [K] from that of the outer face.
+    """Compute the temperature (layer, time) from that of the outer face (time,) every `dt` [s].
 
-    Parameters
-    ----------
-    face : ndarray, shape (time,)
-        Temperature of the outer face [K or degC] every `dt` seconds; the coil starts in thermal
-        equilibrium with it.
-    dt : float
-        Step [s].
-    layers : int
-        Layers of fiber, from the face to the spool.
-    thickness : float
-        Thickness of the winding [m].
-    diffusivity : float
-        Thermal diffusivity of the potted winding [m2 s-1].
-
-    Returns
-    -------
-    ndarray, shape (layers, time)
-
-    Examples
-    --------
-    >>> after = layer_temperatures(np.r_[20.0, np.full(4000, 30.0)], dt=1.0)[:, -1]
-    >>> bool(np.allclose(after, 30.0, atol=0.01))
-    True
+    The coil starts in thermal equilibrium. Its layers lie between face and spool; `thickness` [m]
+    and thermal `diffusivity` [m2/s] are those of the potted winding.
     """
     advance, drive = _discretise_diffusion(layers, thickness, diffusivity, dt)
     values, vectors = np.linalg.eigh(advance)  # symmetric because the cells are equal
@@ -91,28 +64,10 @@ def layer_temperatures(
 def layer_weights(layers: int, *, trim: float = 0.0, scatter: Array | None = None) -> Array:
     """Compute the weight ``integral of (L - 2 l) dl`` [m2] of each layer of a quadrupole winding.
 
-    The fiber has the length `LENGTH`.
-
-    Parameters
-    ----------
-    layers : int
-        Layers, a multiple of 4.
-    trim : float
-        Offset between the middle of the fiber and the middle of the winding, as a share of the
-        length.
-    scatter : ndarray, shape (layers,), optional
-        Relative error of each layer's length.
-
-    Examples
-    --------
-    >>> w = layer_weights(8)
-    >>> bool(abs(w.sum()) < 1e-9)  # uniform heating cancels
-    True
-    >>> bool(abs(w @ np.arange(8)) < 0.05 * abs(w) @ np.arange(8))  # so does a gradient, nearly
-    True
+    The fiber has the length `LENGTH`, and the winding a multiple of 4 layers. `trim` is the offset
+    between the middles of fiber and winding, as a share of the length, and `scatter` (layer,) the
+    relative error of the length of each layer.
     """
-    if layers % 4:
-        raise ValueError(f"a quadrupole has a multiple of 4 layers, not {layers}")
     half = LENGTH / layers
     lengths = np.full(layers, half) * (1.0 if scatter is None else 1.0 + scatter)
     side = np.where(np.isin(np.arange(layers) % 4, (0, 3)), 1.0, -1.0)

@@ -40,18 +40,8 @@ _MAX_WHITE_SHARE = 2.0  # of a level; above 1 only because both are estimates
 def mean_size(scenario: Scenario, mean: Array, *, white: bool = False) -> float:
     """Compute the size of a mean (axis, time) [deg/h] in units of the limit.
 
-    The size is proportional to the amplitude of the mean.
-
-    Parameters
-    ----------
-    mean : ndarray, shape (axis, time)
-    white : bool
-        Whether to count white noise only: the limit in its simplest form.
-
-    Returns
-    -------
-    float
-        The square root of the expected log-likelihood over `NATS`.
+    It is the square root of the expected log-likelihood over `NATS`, and proportional to the
+    amplitude. With `white`, only white noise counts: the limit in its simplest form.
     """
     nats = 0.0
     for axis, f, power in _mean_spectra(scenario, mean):
@@ -100,16 +90,12 @@ def _mean_spectra(scenario: Scenario, mean: Array) -> Iterator[tuple[int, Array,
 
 
 def learned_nats(scenario: Scenario, mean: Array) -> float:
-    """Compute the evidence expected for a known mean over noise fitted without it [nats].
+    """Compute the evidence [nats] expected for a mean (axis, time) over noise fitted without it.
 
     The fit without the mean attributes a slow mean to angle random walk, bias instability and rate
     random walk in part, which reduces the evidence compared with noise that is known beforehand.
     In measured noise the fit may scale the measured spectrum, and add bias instability and rate
     random walk.
-
-    Parameters
-    ----------
-    mean : ndarray, shape (axis, time)
     """
     return sum(
         _divergence_from_noise(scenario, axis, f, power)
@@ -130,12 +116,7 @@ def learned_random_nats(
 ) -> float:
     """Compute the evidence expected for random noise over noise fitted without it [nats].
 
-    Parameters
-    ----------
-    shares : ndarray, shape (axis,)
-        Factors of the axes.
-    density : callable
-        Two-sided density [(deg/h)2/Hz] of a share of 1 at frequencies [Hz].
+    `density` is the two-sided density [(deg/h)2/Hz] of a share (axis,) of 1 at frequencies [Hz].
     """
     f = np.arange(1, scenario.size) * scenario.rate / (2 * scenario.size)
     recorded_share = float((~scenario.missing).mean())
@@ -151,12 +132,8 @@ def learned_random_nats(
 def filtered_density(scenario: Scenario, gain: Array) -> Array:
     """Compute the density [(deg/h)2/Hz] (axis, frequency) of N behind a filter, and of Q.
 
-    The angle is quantized after the filter.
-
-    Parameters
-    ----------
-    gain : ndarray, shape (frequency,)
-        Power gain at frequencies that divide (0, rate / 2) equally.
+    The angle is quantized after the filter. `gain` is the power gain at frequencies that divide
+    (0, rate / 2) equally.
     """
     f = (np.arange(gain.size) + 0.5) / gain.size * scenario.rate / 2
     return np.stack(
@@ -172,12 +149,8 @@ def learned_filter_nats(scenario: Scenario, gain: Array) -> float:
     """Compute the evidence expected for a filter over fitted white noise and Q [nats].
 
     To first order a short filter takes away what a smaller Q takes away. A filter of weight a is
-    therefore seen only where Q has less than about 2 a of the variance of a sample.
-
-    Parameters
-    ----------
-    gain : ndarray, shape (frequency,)
-        Power gain at frequencies that divide (0, rate / 2) equally.
+    therefore seen only where Q has less than about 2 a of the variance of a sample. `gain` is that
+    of `filtered_density`.
     """
     f = (np.arange(gain.size) + 0.5) / gain.size * scenario.rate / 2
     terms = np.stack([floor_psd(f, noise={term: 1.0}, rate=scenario.rate) for term in "NQ"])
@@ -262,12 +235,9 @@ def _samples_per_second(scenario: Scenario, ratio: Array) -> Array:
 def variance_size(scenario: Scenario, ratio: Array) -> float:
     """Compute the size of a change of the noise density in units of the limit.
 
-    Parameters
-    ----------
-    ratio : ndarray, shape (axis, second) or (axis, second, frequency)
-        Density with the effect over density without; the frequencies divide (0, rate / 2) equally.
-        With length 1 along the second dimension the change is permanent and is compared with no
-        change; otherwise it is compared with its mean over time.
+    `ratio` (axis, second) or (axis, second, frequency) is the density with the effect over that
+    without; the frequencies divide (0, rate / 2) equally. With length 1 along the second dimension
+    the change is permanent, and compared with no change, otherwise with its mean over time.
     """
     if scenario.measured is not None:
         return math.sqrt(_measured_nats(scenario, ratio) / NATS)
@@ -331,14 +301,8 @@ def shared_size(scenario: Scenario, shares: Array, power: Array) -> float:
 
     In known noise this is the Gaussian divergence from independent white noise. In measured noise
     only the coherence of the axes counts, which falls where an axis has more than white noise.
-
-    Parameters
-    ----------
-    shares : ndarray, shape (axis,)
-        Correlation of each axis with the source.
-    power : ndarray, shape (frequency,)
-        Density of the source, with mean 1, at frequencies that divide (0, rate / 2) equally, a
-        multiple of `BANDS`.
+    `shares` (axis,) are the correlations with the source, and `power` (frequency,) its density,
+    with mean 1, at a multiple of `BANDS` frequencies that divide (0, rate / 2) equally.
     """
     square = shares**2
     if scenario.measured is None:
@@ -357,13 +321,7 @@ def shared_size(scenario: Scenario, shares: Array, power: Array) -> float:
 def amplitude_for(
     size_of: Callable[[float], float], strength: float, *, first: float = 1.0
 ) -> float:
-    """Find the amplitude at which the increasing function `size_of` reaches `strength`, to 0.1 %.
-
-    Examples
-    --------
-    >>> round(amplitude_for(lambda a: 3 * a**2, 12.0), 2)
-    2.0
-    """
+    """Find the amplitude at which the increasing `size_of` reaches `strength`, to 0.1 %."""
     low, high = 0.0, first
     for _ in range(60):
         if size_of(high) > strength:

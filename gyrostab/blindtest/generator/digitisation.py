@@ -10,15 +10,10 @@ from numpy.typing import NDArray
 
 from gyrostab.blindtest.generator import loop
 from gyrostab.blindtest.generator.detection_limits import NATS, NATS_PER_SAMPLE
-from gyrostab.blindtest.generator.noise_floor import white_level
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario
-from gyrostab.blindtest.generator.shapes import make_variance_effect
+from gyrostab.blindtest.generator.shapes import make_variance_effect, sample_sd
 
 Array = NDArray[np.float64]
-
-
-def _sample_sd(scenario: Scenario, axis: int) -> float:
-    return white_level(scenario.noise[axis]["N"]) * math.sqrt(scenario.rate)
 
 
 def rate_quantization(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
@@ -27,7 +22,7 @@ def rate_quantization(scenario: Scenario, rng: np.random.Generator, *, strength:
     Every sample is on the grid of the steps, which shows them at any size.
     """
     cut = rng.random() < 0.5
-    sd = np.array([_sample_sd(scenario, i) for i in range(len(AXES))])
+    sd = np.array([sample_sd(scenario, i) for i in range(len(AXES))])
     effect, step = make_variance_effect(
         scenario,
         lambda a: 1 + (a**2 / 12 / sd**2)[:, None],
@@ -50,7 +45,7 @@ def dead_zone(scenario: Scenario, rng: np.random.Generator, *, strength: float) 
     axis = int(rng.integers(3))
     share = NATS * strength**2 / NATS_PER_SAMPLE / float((~scenario.missing).sum())
     width = (
-        share * _sample_sd(scenario, axis) * math.sqrt(math.pi / 2)
+        share * sample_sd(scenario, axis) * math.sqrt(math.pi / 2)
     )  # expected share of normal samples within +- width
 
     def after(record: Array) -> Array:
@@ -86,7 +81,7 @@ def clipping(scenario: Scenario, rng: np.random.Generator, *, strength: float) -
         low = ordered[below - 1 : below + 1].mean() if below else -np.inf
         high = ordered[above - 1 : above + 1].mean()
         if soft:  # compress the last tenth of a standard deviation before the limit
-            bend = high - 0.1 * _sample_sd(scenario, axis)
+            bend = high - 0.1 * sample_sd(scenario, axis)
             row = np.where(row > bend, (row + bend) / 2, row)
             high = (high + bend) / 2
         out = record.copy()

@@ -21,7 +21,6 @@ from gyrostab.blindtest.generator.detection_limits import (
 )
 from gyrostab.blindtest.generator.environment import lag
 from gyrostab.blindtest.generator.measured_noise import BANDS
-from gyrostab.blindtest.generator.noise_floor import white_level
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
 from gyrostab.blindtest.generator.shapes import (
     axes_with_share,
@@ -29,6 +28,7 @@ from gyrostab.blindtest.generator.shapes import (
     fit_lagged_driver,
     make_mean_effect,
     make_variance_effect,
+    sample_sd,
     scale_by_axis,
 )
 
@@ -258,19 +258,10 @@ def logger_filter(scenario: Scenario, rng: np.random.Generator, *, strength: flo
     return replace(effect, after=after, parameters=parameters, learned_nats=learned)
 
 
-def _sample_sd(scenario: Scenario, axis: int) -> float:
-    measured = scenario.measured
-    return (
-        white_level(scenario.noise[axis]["N"]) * math.sqrt(scenario.rate)
-        if measured is None
-        else float(measured.outlier_sigma[axis])
-    )
-
-
 def spikes(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
     """Draw flipped bits; a spike is worth its chi-square less the log of its possible places."""
     axis = int(rng.integers(3))
-    sd = _sample_sd(scenario, axis)
+    sd = sample_sd(scenario, axis)
     n = int((~scenario.missing).sum())
     number = int(rng.integers(2, 25))
     worth = NATS * strength**2 / number + math.log(n)

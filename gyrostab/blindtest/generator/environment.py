@@ -28,12 +28,7 @@ def lag(values: Array, tau: float, *, dt: float = 1.0) -> Array:
 def temperature(rng: np.random.Generator, seconds: float, *, still: bool = False) -> Array:
     """Draw the temperature of the housing [degC], one value a second: ramps, plateaus, reversals.
 
-    Parameters
-    ----------
-    seconds : float
-        Length [s].
-    still : bool
-        Whether there is only a slow wander.
+    If `still`, there is only a slow wander.
 
     Examples
     --------
@@ -67,14 +62,7 @@ def shaking(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Draw the rms acceleration [g], one value a second, and the mask of its bursts.
 
-    Parameters
-    ----------
-    seconds : float
-        Length [s].
-    bursts : int
-        Number of bursts, each with a separate level.
-    longest : float
-        Longest burst [s].
+    Each of the bursts has a separate level, and is at most `longest` [s].
 
     Examples
     --------

@@ -66,18 +66,10 @@ class MeasuredNoise:
         return np.asarray(share.reshape(number, seconds) / self.block @ values)
 
     def change_nats(self, change: Array, *, axis: int) -> float:
-        """Compute the evidence for a known change of level against the fluctuation of the level.
+        """Compute the evidence [nats] for a known change of level against its fluctuation.
 
-        Parameters
-        ----------
-        change : ndarray, shape (block, band)
-            Change of the logarithm of the density.
-
-        Returns
-        -------
-        float
-            Expected log-likelihood [nats]; the bands have the weights that are best for a steady
-            level.
+        `change` (block, band) is that of the logarithm of the density. The bands have the weights
+        that are best for a steady level.
         """
         present = np.isfinite(self.log_power[axis]).all(axis=1)
         change = change[present] - change[present].mean(axis=0)
@@ -99,12 +91,6 @@ def line_density(values: Array, *, rate: float) -> Array:
 
     The ratio of each line to a fitted slope (white, flicker and random walk) is averaged over 33
     lines.
-
-    Examples
-    --------
-    >>> found = line_density(np.random.default_rng(0).normal(0, 3.0, 10_000), rate=100.0)
-    >>> found.size, round(float(found.mean()), 2)
-    (9999, 0.09)
     """
     present = np.isfinite(values)
     filled = np.where(present, values - values[present].mean(), 0.0)
@@ -183,24 +169,9 @@ def _outlier_sigma(values: Array, lines: Array, *, rate: float) -> float:
 
 
 def measure_noise(record: Array, *, rate: float, axes: int | None = None) -> MeasuredNoise:
-    """Measure the noise of a real record.
+    """Measure the noise of a real record (axis, time) [deg/h], NaN where lost, at a rate [Hz].
 
-    Parameters
-    ----------
-    record : ndarray, shape (axis, time)
-        Rates [deg/h], NaN where lost.
-    rate : float
-        Rate [Hz].
-    axes : int, optional
-        Number of axes to return; missing ones repeat the first.
-
-    Examples
-    --------
-    >>> found = measure_noise(np.random.default_rng(0).normal(0, 1.8, (1, 100_000)), rate=100.0)
-    >>> bool(abs(np.median(found.level[0]) / 0.0324 - 1) < 0.02)
-    True
-    >>> bool(abs(found.outlier_sigma[0] / 1.8 - 1) < 0.05)
-    True
+    Axes that the record lacks of the number `axes` repeat the first.
     """
     block = max(math.ceil(rate), _MIN_BLOCK_SAMPLES)
     lines = np.stack([line_density(row, rate=rate) for row in record])

@@ -11,30 +11,18 @@ from scipy.signal import lfilter
 
 Array = NDArray[np.float64]
 
-_URAD = math.degrees(1e-6) * 3600.0  # urad -> deg/h s
+URAD = math.degrees(1e-6) * 3600.0  # urad -> deg/h s
 
 
 def white_level(n: float) -> float:
-    """Convert an angle random walk `n` [deg/sqrt(h)] to a root density [deg/h per root Hz].
-
-    Examples
-    --------
-    >>> white_level(0.003)
-    0.18
-    """
+    """Convert an angle random walk `n` [deg/sqrt(h)] to a root density [deg/h per root Hz]."""
     return 60.0 * n
 
 
 def floor_psd(frequency: Array, *, noise: dict[str, float], rate: float) -> Array:
-    """Compute the two-sided density [(deg/h)2/Hz] of Q [urad], N, B and K at frequencies [Hz] > 0.
-
-    Examples
-    --------
-    >>> float(floor_psd(np.array([5.0]), noise={"N": 0.003}, rate=100.0)[0].round(6))
-    0.0324
-    """
+    """Compute the two-sided density [(deg/h)2/Hz] of N, B, K, Q [urad] at frequencies > 0 [Hz]."""
     f = np.asarray(frequency, dtype=float)
-    q = noise.get("Q", 0.0) * _URAD
+    q = noise.get("Q", 0.0) * URAD
     return np.asarray(
         white_level(noise.get("N", 0.0)) ** 2
         + 4 * q**2 * rate * np.sin(math.pi * f / rate) ** 2
@@ -46,21 +34,7 @@ def floor_psd(frequency: Array, *, noise: dict[str, float], rate: float) -> Arra
 def flicker(
     rng: np.random.Generator, size: int, *, b: float, rate: float, method: str = "spectrum"
 ) -> Array:
-    """Draw bias instability `b` [deg/h] from its spectrum, or as a sum of many relaxations.
-
-    Parameters
-    ----------
-    b : float
-        Coefficient B [deg/h].
-    rate : float
-        Rate [Hz].
-    method : {"spectrum", "relaxations"}
-
-    Examples
-    --------
-    >>> flicker(np.random.default_rng(0), 1000, b=0.0, rate=10.0).std()
-    np.float64(0.0)
-    """
+    """Draw bias instability `b` [deg/h] from its "spectrum", or as a sum of many "relaxations"."""
     if b == 0:
         return np.zeros(size)
     if method == "spectrum":
@@ -87,39 +61,18 @@ def flicker(
 
 
 def random_walk(rng: np.random.Generator, size: int, *, k: float, rate: float) -> Array:
-    """Draw a rate random walk `k` [deg/h^1.5] that starts at 0.
-
-    Examples
-    --------
-    >>> steps = np.diff(random_walk(np.random.default_rng(0), 100_000, k=1.0, rate=1.0))
-    >>> round(float(steps.std() * 60), 1)
-    1.0
-    """
+    """Draw a rate random walk `k` [deg/h^1.5] that starts at 0."""
     return np.asarray(np.cumsum(rng.standard_normal(size)) * k / math.sqrt(3600.0 * rate))
 
 
 def quantize_angle(values: Array, *, q: float, rate: float, first: float = 0.0) -> Array:
-    """Quantize rates [deg/h] like an angle counter with noise `q` [urad]: differences of steps.
+    """Quantize rates (time,) [deg/h] like an angle counter: they become differences of steps.
 
-    Parameters
-    ----------
-    values : ndarray, shape (time,)
-        Rates [deg/h].
-    q : float
-        Coefficient Q [urad]: angle step over root 12.
-    rate : float
-        Rate [Hz].
-    first : float
-        Initial position of the angle within its step, 0 to 1.
-
-    Examples
-    --------
-    >>> out = quantize_angle(np.full(1000, 7.3), q=0.5, rate=10.0)
-    >>> len(set(out.round(6).tolist())), round(float(out.mean()), 1)
-    (2, 7.3)
+    `q` is the coefficient Q [urad], the step of the angle over root 12, and `first` the initial
+    position of the angle within its step, 0 to 1.
     """
     if q == 0:
         return np.asarray(values, dtype=float)
-    step = q * _URAD * math.sqrt(12.0)
+    step = q * URAD * math.sqrt(12.0)
     angle = np.floor(np.cumsum(np.asarray(values, dtype=float) / rate) / step + first)
     return np.asarray(np.diff(angle, prepend=math.floor(first)) * step * rate)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gyrostab.blindtest.generator import environment, telemetry, tool
 from gyrostab.blindtest.generator.measured_noise import MeasuredNoise
+from gyrostab.blindtest.generator.noise_floor import URAD
 
 Array = NDArray[np.float64]
 
@@ -143,8 +144,7 @@ def _draw_noise(
     axes = []
     for _ in AXES:
         coefficients = {key: value * rng.uniform(0.8, 1.25) for key, value in base.items()}
-        urad = math.degrees(1e-6) * 3600.0
-        coefficients["Q"] = math.sqrt(share / 3.0) * 60 * coefficients["N"] / math.sqrt(rate) / urad
+        coefficients["Q"] = math.sqrt(share / 3.0) * 60 * coefficients["N"] / math.sqrt(rate) / URAD
         axes.append(coefficients)
     return tuple(axes)
 
@@ -172,22 +172,11 @@ def draw_scenario(
     heavy: bool = False,
     sub_threshold: bool = False,
 ) -> Scenario:
-    """Draw the scenario of one case.
+    """Draw the scenario of one case, for a log of `rate` [Hz] and `seconds`.
 
-    Parameters
-    ----------
-    rate : float
-        Rate of the log [Hz].
-    seconds : float
-        Length [s].
-    gaps : float
-        Share of the samples that is missing, in addition to power cuts.
-    cuts : int
-        Number of power cuts.
-    heavy : bool
-        Whether flicker and random walk are unusually strong.
-    sub_threshold : bool
-        Whether to draw long bursts and little random walk, as small, long effects need.
+    `gaps` is the share of samples that is missing, in addition to `cuts` power cuts. In a `heavy`
+    scenario flicker and random walk are unusually strong; a `sub_threshold` one has long bursts and
+    little random walk, as small, long effects need.
 
     Examples
     --------

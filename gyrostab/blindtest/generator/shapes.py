@@ -20,6 +20,7 @@ from gyrostab.blindtest.generator.detection_limits import (
     variance_size,
 )
 from gyrostab.blindtest.generator.environment import lag
+from gyrostab.blindtest.generator.noise_floor import white_level
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
 
 Array = NDArray[np.float64]
@@ -58,6 +59,16 @@ def signed_peaks(effect: Effect, shares: Array) -> dict[str, float]:
     }
 
 
+def sample_sd(scenario: Scenario, axis: int) -> float:
+    """Compute the standard deviation of white noise that one sample must exceed [deg/h]."""
+    measured = scenario.measured
+    return (
+        white_level(scenario.noise[axis]["N"]) * math.sqrt(scenario.rate)
+        if measured is None
+        else float(measured.outlier_sigma[axis])
+    )
+
+
 def fit_lagged_driver(
     scenario: Scenario, mean: Array, driver: Array, *, axis: int
 ) -> tuple[float, float]:
@@ -65,14 +76,6 @@ def fit_lagged_driver(
 
     The sensitivity is the static one. The sensitivity of a lagged mean to the instantaneous driver
     would be smaller, and would depend on the noise.
-
-    Examples
-    --------
-    >>> from gyrostab.blindtest.generator.scenario import draw_scenario
-    >>> scenario = draw_scenario(np.random.default_rng(0), rate=10.0, seconds=900.0)
-    >>> mean = to_samples(scenario, 0.2 * lag(scenario.supply, 40.0))
-    >>> [round(number, 2) for number in fit_lagged_driver(scenario, mean, scenario.supply, axis=0)]
-    [0.2, 40.0]
     """
 
     def late(time: float) -> tuple[float, float]:
@@ -118,21 +121,10 @@ def make_mean_effect(
 ) -> Effect:
     """Make an effect that adds ``shape * shares``, scaled to `strength`.
 
-    Parameters
-    ----------
-    shape : ndarray, shape (time,) or (axis, time)
-        Shape in any unit, one for all axes or one for each.
-    shares : ndarray, shape (axis,)
-        Signed shares of the axes.
-    strength : float
-        Size in units of the limit.
-    form_differs, tau, parameters, **description
-        Fields of `Effect`.
-    regressor : (str, ndarray, str), optional
-        Name of a parameter, the driver it multiplies (time,) and its unit; its true value on every
-        axis is the least-squares fit to the mean.
-    unless : tuple of str
-        Nonlinear terms; where the diagnosis fits one of them, the parameter is not comparable.
+    The shape (time,), or (axis, time), may have any unit; `shares` (axis,) are signed. A
+    `regressor` is the name of a parameter, the driver (time,) it multiplies, and its unit; its true
+    value on every axis is the least-squares fit to the mean. Where the diagnosis fits one of the
+    nonlinear terms `unless`, that parameter is not comparable. All else are fields of `Effect`.
     """
     mean = np.asarray(shares[:, None] * (shape if shape.ndim == 2 else shape[None, :]))
     mean *= strength / mean_size(scenario, mean)
@@ -174,16 +166,9 @@ def make_variance_effect(
 ) -> tuple[Effect, float]:
     """Make an effect on the noise density, and return it with its amplitude.
 
-    Parameters
-    ----------
-    ratio : callable
-        Function from amplitude to the density ratio of `variance_size`; 1 at amplitude 0.
-    strength : float
-        Size in units of the limit.
-    first : float
-        Small amplitude at which the search starts.
-    tau, **description
-        Fields of `Effect`.
+    `ratio` computes the density ratio of `variance_size` from an amplitude, and 1 from amplitude 0;
+    the search for the amplitude of `strength` starts at the small one `first`. All else are fields
+    of `Effect`.
     """
     amplitude = amplitude_for(lambda a: variance_size(scenario, ratio(a)), strength, first=first)
     final = ratio(amplitude)

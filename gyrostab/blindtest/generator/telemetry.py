@@ -18,20 +18,8 @@ def draw_losses(
 ) -> NDArray[np.bool_]:
     """Draw which of `size` samples are lost, in whole frames and bursts of frames.
 
-    Parameters
-    ----------
-    share : float
-        Mean share lost, 0 to below 1.
-    frame : int
-        Samples of a frame.
-    burst : float
-        Mean number of frames lost in a row; with 1 the frames are lost independently.
-
-    Examples
-    --------
-    >>> lost = draw_losses(np.random.default_rng(1), 400_000, share=0.2, frame=10, burst=5.0)
-    >>> bool(abs(lost.mean() - 0.2) < 0.02)
-    True
+    `share`, below 1, is the mean share lost, `frame` the samples of a frame, and `burst` the mean
+    number of frames lost in a row; with 1 the frames are lost independently.
     """
     frames = math.ceil(size / frame)
     if share <= 0:
@@ -99,21 +87,8 @@ def flip_bits(
 ) -> tuple[Array, NDArray[np.int64]]:
     """Flip one bit in `number` samples of two's complement code in steps of `lsb`.
 
-    Parameters
-    ----------
-    values : ndarray, shape (time,)
-        Samples [deg/h].
-    number : int
-        Flips.
-    lsb : float
-        Step of the digitisation [deg/h].
-    bit : int
-        Number of the bit, 0 for the lowest; a flip changes the sample by ``lsb * 2**bit``.
-
-    Returns
-    -------
-    values, where
-        Samples after the flips, and the positions of the flips.
+    Bit 0 is the lowest; a flip changes a sample by ``lsb * 2**bit``. Return the samples after the
+    flips, and the positions of the flips.
 
     Examples
     --------
@@ -149,17 +124,9 @@ def choose_frames(
 
 
 def repeat_frames(values: Array, starts: NDArray[np.int64], *, frame: int, hold: bool) -> Array:
-    """Overwrite frames by a repeat of the previous frame, or of its last sample.
+    """Overwrite frames of values (axis, time), at their first samples `starts`, by earlier values.
 
-    Parameters
-    ----------
-    values : ndarray, shape (axis, time)
-    starts : ndarray
-        First sample of each frame.
-    frame : int
-        Samples of a frame.
-    hold : bool
-        Whether to hold the last sample instead of repeating the frame.
+    They repeat the previous frame, or if `hold`, its last sample.
 
     Examples
     --------

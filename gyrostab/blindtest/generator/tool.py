@@ -16,18 +16,10 @@ EARTH_RATE = 15.041
 def rotation(
     rng: np.random.Generator, seconds: float, *, dt: float, fastest: float = 120.0
 ) -> Array:
-    """Draw the rotation rate [deg/s] of a tool that alternately drills and rests.
+    """Draw the rotation rate [deg/s], every `dt` [s], of a tool that alternately drills and rests.
 
-    In some intervals stick-slip makes the rate oscillate at 0.1-0.5 Hz.
-
-    Parameters
-    ----------
-    seconds : float
-        Length [s].
-    dt : float
-        Step [s].
-    fastest : float
-        Highest speed [revolutions per minute]; `dt` and the rate of the log must resolve it.
+    In some intervals stick-slip makes the rate oscillate at 0.1-0.5 Hz. The highest speed `fastest`
+    [revolutions per minute] must be resolved by `dt` and the rate of the log.
 
     Examples
     --------
@@ -66,25 +58,11 @@ def toolface(rotation_rate: Array, *, dt: float, first: float = 0.0) -> Array:
 
 
 def cross_axis(angle: Array, *, across: float) -> tuple[Array, Array]:
-    """Project a fixed vector of size `across` on the rotating axes x and y.
-
-    Examples
-    --------
-    >>> x, y = cross_axis(np.array([0.0, math.pi / 2]), across=10.0)
-    >>> x.round(6).tolist(), y.round(6).tolist()
-    ([10.0, 0.0], [-0.0, -10.0])
-    """
+    """Project a fixed vector of size `across` on the rotating axes x and y."""
     return np.asarray(across * np.cos(angle)), np.asarray(-across * np.sin(angle))
 
 
 def gravity(angle: Array, *, inclination: float) -> tuple[Array, Array, Array]:
-    """Compute gravity [g] along x, y, z of a tool at an `inclination` [deg] from vertical.
-
-    Examples
-    --------
-    >>> parts = gravity(np.array([0.7]), inclination=30.0)
-    >>> round(float(sum(p[0] ** 2 for p in parts)), 6)
-    1.0
-    """
+    """Compute gravity [g] along x, y, z of a tool at an `inclination` [deg] from vertical."""
     x, y = cross_axis(angle, across=math.sin(math.radians(inclination)))
     return x, y, np.full(np.shape(angle), math.cos(math.radians(inclination)))

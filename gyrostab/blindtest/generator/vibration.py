@@ -26,14 +26,7 @@ def _filtered_variance(sos: Array, low: float) -> float:
 
 
 def band_noise(rng: np.random.Generator, size: int, *, low: float, high: float) -> Array:
-    """Draw acceleration of unit rms between two frequencies [Hz], `size` samples at `FAST_HZ`.
-
-    Examples
-    --------
-    >>> x = band_noise(np.random.default_rng(0), 200_000, low=700, high=800)
-    >>> bool(abs(x.std() - 1) < 0.03)
-    True
-    """
+    """Draw acceleration of unit rms between two frequencies [Hz], `size` samples at `FAST_HZ`."""
     sos = _design_bandpass(low, high)
     settle = round(2 * FAST_HZ / low)
     x = signal.sosfilt(sos, rng.standard_normal(size + settle))[settle:]
@@ -41,14 +34,7 @@ def band_noise(rng: np.random.Generator, size: int, *, low: float, high: float) 
 
 
 def mount_filter(resonance: float, *, quality: float) -> tuple[Array, Array]:
-    """Design the filter (b, a) at `FAST_HZ` of a damped mount with a `resonance` [Hz].
-
-    Examples
-    --------
-    >>> b, a = mount_filter(120.0, quality=8.0)
-    >>> round(float(abs(signal.freqz(b, a, worN=[120.0], fs=FAST_HZ)[1][0])), 1)  # root(1 + Q^2)
-    8.1
-    """
+    """Design the filter (b, a) at `FAST_HZ` of a damped mount with a `resonance` [Hz]."""
     w = 2 * math.pi * resonance
     warped = 2 * FAST_HZ * math.tan(w / (2 * FAST_HZ))
     damping = warped / quality
@@ -57,19 +43,10 @@ def mount_filter(resonance: float, *, quality: float) -> tuple[Array, Array]:
 
 
 def decimator_taps(rate: float, kind: str) -> Array:
-    """Compute the weights of the decimator from `FAST_HZ` to `rate` [Hz]; they sum to 1.
+    """Compute the weights, of sum 1, of the decimator from `FAST_HZ` to its divisor `rate` [Hz].
 
-    Parameters
-    ----------
-    rate : float
-        Rate of the log [Hz], a divisor of `FAST_HZ`.
-    kind : {"point", "dump", "cic2", "fir"}
-        Every n-th value, integrate and dump, two of these in series, or a short windowed sinc.
-
-    Examples
-    --------
-    >>> decimator_taps(400.0, "dump").size
-    10
+    Kinds are "point" (every n-th value), "dump" (integrate and dump), "cic2" (two of these in
+    series) and "fir" (a short windowed sinc).
     """
     factor = round(FAST_HZ / rate)
     box = np.full(factor, 1.0 / factor)
@@ -82,13 +59,7 @@ def decimator_taps(rate: float, kind: str) -> Array:
 
 
 def decimate(x: Array, *, rate: float, kind: str) -> Array:
-    """Decimate `x` from `FAST_HZ` to `rate` [Hz] like the logger.
-
-    Examples
-    --------
-    >>> decimate(np.ones(40_000), rate=100.0, kind="cic2").round(6)[[5, 500]].tolist()
-    [1.0, 1.0]
-    """
+    """Decimate `x` from `FAST_HZ` to `rate` [Hz] like the logger."""
     factor = round(FAST_HZ / rate)
     smooth = signal.oaconvolve(x, decimator_taps(rate, kind))[: x.size]
     return np.asarray(smooth[factor - 1 :: factor])
@@ -103,15 +74,7 @@ def folded_psd(
     high: float,
     mount: tuple[Array, Array] | None = None,
 ) -> Array:
-    """Compute the aliased two-sided density [1/Hz] of unit-rms band noise after the decimator.
-
-    Examples
-    --------
-    >>> f = (np.arange(200) + 0.5)
-    >>> flat = folded_psd(f, rate=400.0, kind="point", low=700, high=800)
-    >>> round(float(2 * flat.sum()), 1)  # nothing of the band is lost
-    1.0
-    """
+    """Compute the aliased two-sided density [1/Hz] of unit-rms band noise after the decimator."""
     sos = _design_bandpass(low, high)
     level = 1.0 / (FAST_HZ * _filtered_variance(sos, low))
     taps = decimator_taps(rate, kind)
@@ -129,12 +92,6 @@ def folded_psd(
 
 
 def rectify(rms: Array, *, exponent: float, saturation: float) -> Array:
-    """Compute the shift of the mean by vibration `rms` [g], with exponent and saturation [g].
-
-    Examples
-    --------
-    >>> rectify(np.array([1.0, 2.0, 100.0]), exponent=2.0, saturation=np.inf).tolist()
-    [1.0, 4.0, 10000.0]
-    """
+    """Compute the shift of the mean by vibration `rms` [g], with exponent and saturation [g]."""
     rms = np.asarray(rms, dtype=float)
     return np.asarray(rms**exponent / (1.0 + (rms / saturation) ** exponent))

@@ -28,16 +28,8 @@ def wander_size(
 
     Only the power of a random bias can be known: at each frequency ``k / 2T`` of a record of length
     T, its density changes one log variance, and
-    `gyrostab.blindtest.generator.detection_limits` gives the evidence for that.
-
-    Parameters
-    ----------
-    shares : ndarray, shape (axis,)
-        Factors of the axes, in addition to `rms`.
-    time : float
-        Correlation time [s].
-    rms : float
-        Standard deviation [deg/h].
+    `gyrostab.blindtest.generator.detection_limits` gives the evidence for that. The bias has the
+    correlation `time` [s], and the standard deviation `rms` [deg/h] times the share of an axis.
     """
     f = np.arange(1, min(scenario.size, math.ceil(20 * scenario.seconds / time) + 50)) / (
         2 * scenario.seconds
