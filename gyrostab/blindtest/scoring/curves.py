@@ -35,7 +35,7 @@ def curves(rows: Sequence[Row]) -> pd.DataFrame:
     For an effect out of catalogue, unidentified counts as named. Similar strengths count together;
     ``strength`` is their geometric mean.
     """
-    groups = defaultdict(list)
+    groups: defaultdict[tuple[str, int], list[Row]] = defaultdict(list)
     for row in rows:
         place = bisect(_EFFECT_LIMITS, row["strength"])
         if row["kind"] == "out_of_catalogue":

@@ -41,7 +41,7 @@ def _list_comparisons(
         is_case = np.arange(len(records)) >= len(noise)
         scores = [{"diagnosis": row["score"], **row["baseline_detectors"]} for row in records]
         for name in ("diagnosis", *cases[0]["baseline_detectors"]):
-            line = {"cases": group, "detector": name}
+            line: dict[str, Any] = {"cases": group, "detector": name}
             out.append((line, records, np.array([row[name] for row in scores], float), is_case))
     return out
 
