@@ -13,7 +13,7 @@ from os import PathLike
 from pathlib import Path
 
 #: Errors of the operating system that concern the process or the path, not the content of a file.
-_SYSTEM_ERRNOS = (
+SYSTEM_ERRNOS = (
     errno.EACCES, errno.EDQUOT, errno.EFBIG, errno.EINTR, errno.EISDIR, errno.ELOOP, errno.EMFILE,
     errno.ENAMETOOLONG, errno.ENFILE, errno.ENOENT, errno.ENOMEM, errno.ENOSPC,
     errno.ENOTDIR, errno.EPERM, errno.ESTALE,
@@ -89,7 +89,7 @@ def reading_of(path: str | PathLike[str]) -> Iterator[None]:
     except GyrostabError:
         raise
     except OSError as error:
-        if error.errno in _SYSTEM_ERRNOS:
+        if error.errno in SYSTEM_ERRNOS:
             raise
         raise _describe_damage(path, error) from error
     except Exception as error:

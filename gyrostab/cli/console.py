@@ -16,7 +16,7 @@ from typing import Any, TextIO
 from cyclopts import CycloptsError
 
 from gyrostab.cli.options import read_toml
-from gyrostab.errors import GyrostabError, OptionError
+from gyrostab.errors import SYSTEM_ERRNOS, GyrostabError, OptionError
 
 
 def attach_negative_values(tokens: Sequence[str]) -> list[str]:
@@ -128,16 +128,13 @@ def describe_error(error: Exception) -> int:
         return print_error(f"{error} See gyrostab --help, or the command's own --help.", 2)
     if isinstance(error, GyrostabError):
         return print_error(str(error), 2)
-    if (
-        isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError)
-        and error.filename
-    ):
-        return print_error(f"{error.filename}: {error.strerror}", 2)
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         where = error.filename or "the standard output"
         return print_error(
             f"{where}: cannot be written ({error.strerror}); make room, or write elsewhere", 2
         )
+    if isinstance(error, OSError) and error.errno in SYSTEM_ERRNOS and error.filename:
+        return print_error(f"{error.filename}: {error.strerror}", 2)
     if isinstance(error, MemoryError):
         return print_error(
             f"out of memory ({error}); use fewer --taus, a longer --step, or fewer --workers",

@@ -210,6 +210,20 @@ def test_bad_input_is_one_message_and_nothing_left_behind(case, tmp_path, capfd)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.parametrize("make", [
+    lambda log, name: ["scan", f"{name}.csv"],
+    lambda log, name: ["ingest", log, "-o", "log.nc", "--channel", f"{name}.csv"],
+    lambda log, name: ["run", log, "-o", f"{name}.nc", *WINDOW],
+    lambda log, name: ["report", f"{name}.nc", "-o", "report.html"],
+])  # fmt: skip
+def test_a_name_that_is_too_long_is_bad_input(make, log, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    name = 300 * "n"
+    assert call(*make(log, name)) == 2
+    *_, message = capfd.readouterr().err.splitlines()
+    assert re.fullmatch(rf"gyrostab: .*{name}\S*: File name too long.*", message), message
+
+
 @pytest.mark.parametrize("options", [
     "--taus banana", "--taus 0", "--tau-max banana", "--step 0s", "--terms XYZ",
     "--fit-from banana", "--fit-to 0s", "--exclude 1min", "--exclude 1min/banana", "--from banana",
