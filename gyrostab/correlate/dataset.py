@@ -149,12 +149,12 @@ def _limit_flags(
     shape: tuple[int, ...], entries: Mapping[tuple[int, int, int], Mapping[str, Any]]
 ) -> tuple[Any, dict[str, Any]]:
     """Set one bit for each limit of a verdict, with the attributes that name the bits."""
-    masks = {name: np.int8(1 << bit) for bit, name in enumerate(LIMITS)}
-    bits = np.zeros(shape, np.int8)
+    masks = {name: np.int16(1 << bit) for bit, name in enumerate(LIMITS)}
+    bits = np.zeros(shape, np.int16)
     for place, entry in entries.items():
         bits[place] = sum(int(masks[name]) for name in entry["limits"])
     meanings = {
-        "flag_masks": np.array(list(masks.values()), np.int8),
+        "flag_masks": np.array(list(masks.values()), np.int16),
         "flag_meanings": " ".join(masks),
     }
     return bits, {"long_name": "what limits the verdict", **meanings}

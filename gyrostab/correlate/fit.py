@@ -101,7 +101,8 @@ def fit_driver(
 ) -> list[dict[str, Any]]:
     """Fit one driver to series that share their windows, with one entry per series."""
     if blocks is None:
-        return [_empty_entry({"too_few"}) for _ in range(series.shape[1])]
+        reason = "too_few" if np.isfinite(driver.values).any() else "no_values"
+        return [_empty_entry({reason}) for _ in range(series.shape[1])]
     x = np.asarray(blocks.average @ driver.values[:, blocks.windows].T)
     y = np.asarray(blocks.average @ series)
     limits = driver_limits(x[:, 0], blocks.pieces, driver.units, derived=driver.derived)
@@ -132,7 +133,7 @@ def fit_driver(
     entries = []
     for row in y.T:
         if np.ptp(row) == 0.0:
-            entries.append(_empty_entry(limits | {"too_few"}, windows=blocks.windows.size))
+            entries.append(_empty_entry(limits | {"constant_series"}, windows=blocks.windows.size))
             continue
         entry = _estimate_sensitivity(laws, row, x, lags, level) | {
             "limits": set(limits),

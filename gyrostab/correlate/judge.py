@@ -26,7 +26,11 @@ LIMITS = {
     "no_plateau": "{driver} is hardly ever constant, so its effect and that of its rate of change "
     "look alike",
     "other_channel": "another channel explains it equally well",
+    "no_values": "{driver} has no value in any window",
+    "constant_series": "{series} is constant",
 }
+#: Limits that leave no verdict, in the order in which a sentence names them.
+_HARD_LIMITS = ("constant", "too_few", "clusters", "one_moment", "no_values", "constant_series")
 _READABLE = {"degree": "deg", "hour": "h", "degree_Celsius": "K", "standard_free_fall": "g"}
 _MIN_RANGE = {"degree_Celsius": 0.02}  # a channel with a smaller range counts as constant
 
@@ -123,12 +127,16 @@ def format_p_value(p: float) -> str:
 def describe_coupling(entry: dict[str, Any], driver: str, series: str) -> str:
     """Describe the coupling of a series with a driver in one sentence."""
     driver = f"the {driver}" if driver.startswith("rate of change") else driver
-    reasons = [LIMITS[name].format(driver=driver) for name in LIMITS if name in entry["limits"]]
+    reasons = [
+        text.format(driver=driver, series=series)
+        for name, text in LIMITS.items()
+        if name in entry["limits"]
+    ]
     verdict = VERDICTS[entry["verdict"]]
     if verdict == "cannot_tell":
         hard = [
-            LIMITS[name].format(driver=driver)
-            for name in ("constant", "too_few", "clusters", "one_moment")
+            LIMITS[name].format(driver=driver, series=series)
+            for name in _HARD_LIMITS
             if name in entry["limits"]
         ]
         reason = "; ".join(hard) or "no window holds both"

@@ -290,6 +290,13 @@ def test_statement_gives_the_reason_why_a_record_cannot_tell():
     assert "temperature is constant" in str(flat["statement"].values[0, 0, 0])
     few = gyrostab.correlate(coupled.product(windows=16), variables="window_mean")
     assert "too few independent windows" in str(few["statement"].values[0, 0, 0])
+    absent = coupled.product(axes="x")
+    absent["window_mean"][:] = 5.0
+    still = gyrostab.correlate(absent, variables="window_mean")
+    assert str(still["statement"].values[0, 0, 0]).endswith("window mean of axis x is constant.")
+    absent["temperature"][:] = np.nan
+    unknown = gyrostab.correlate(absent, variables="window_mean", channel="temperature")
+    assert "temperature has no value in any window" in str(unknown["statement"].values[0, 0, 0])
     rise = gyrostab.correlate(
         coupled.product(heat="rise", slope=1.0, noises="white"), variables="window_mean", max_lag=0
     )
