@@ -172,7 +172,8 @@ def find_fit_from(product: xr.Dataset) -> float | None:
     """Find the shortest averaging time from which the fitted terms describe a product.
 
     A filter, a spectral line or motion bends the curve at short averaging times. Up to 24 windows,
-    spread over the record, are fitted again from averaging times a factor of two apart.
+    spread over the record, are fitted again from averaging times a factor of two apart. Windows
+    with outliers do not count, because outliers add to N at every averaging time.
 
     Returns
     -------
@@ -180,11 +181,13 @@ def find_fit_from(product: xr.Dataset) -> float | None:
         Averaging time [s] for ``--fit-from`` (``tau_min`` of `gyrostab.fit_noise`); None if the
         terms describe the product as it is, or no such averaging time leaves a decade to fit.
     """
-    failing = [summary.axis for summary in summarise_fit(product) if summary.fails]
+    judged = _without_outliers(product)
+    failing = [summary.axis for summary in summarise_fit(judged) if summary.fails]
     if not failing:
         return None
-    count = product.sizes["time"]
-    tried = np.unique(np.linspace(0, count - 1, min(_MAX_TRIED_WINDOWS, count)).round().astype(int))
+    used = np.flatnonzero(np.isfinite(judged["fit_chi2"].sel(axis=failing)).any("axis").values)
+    places = np.linspace(0, used.size - 1, min(_MAX_TRIED_WINDOWS, used.size))
+    tried = used[np.unique(places.round().astype(int))]
     windows = product.sel(axis=failing).isel(time=tried).compute()
     tau = windows["tau"].values
     longest = float(product.attrs.get("fit_tau_max_s", tau[-1]))
@@ -192,12 +195,18 @@ def find_fit_from(product: xr.Dataset) -> float | None:
     for start in tau[tau <= longest / _MIN_TAU_RATIO]:
         if start < shortest:
             continue
-        if not any(
-            summary.fails for summary in summarise_fit(refit(windows, tau_min=float(start)))
-        ):
+        refitted = _without_outliers(refit(windows, tau_min=float(start)))
+        if not any(summary.fails for summary in summarise_fit(refitted)):
             return float(start)
         shortest = 2.0 * start
     return None
+
+
+def _without_outliers(product: xr.Dataset) -> xr.Dataset:
+    """Remove the misfit of the windows that hold outliers."""
+    if "outlier_count" not in product:
+        return product
+    return product.assign(fit_chi2=product["fit_chi2"].where(product["outlier_count"] == 0))
 
 
 def format_product(product: xr.Dataset) -> str:
@@ -292,14 +301,15 @@ def _describe_misfit(product: xr.Dataset) -> list[str]:
     if failing:
         line = f"The terms do not describe {', '.join(failing)}; no term counts as observed there"
         start = find_fit_from(product)
-        remedy = (
-            f"they do from {start:g} s on: fit again with --fit-from {start:g}s"
-            if start
-            else (
+        if start:
+            remedy = f"they do from {start:g} s on: fit again with --fit-from {start:g}s"
+        elif not any(fit.fails for fit in summarise_fit(_without_outliers(product))):
+            remedy = "these windows hold outliers, which no --fit-from removes"
+        else:
+            remedy = (
                 "no --fit-from changes that: look for spectral lines, vibration or motion in the "
                 "record"
             )
-        )
         lines.append(f"{line}; {remedy}.")
     return lines
 
@@ -331,7 +341,10 @@ def _describe_outliers(product: xr.Dataset) -> list[str]:
         if counts.size and counts.max() > 0
     ]
     if affected:
-        return [f"Outliers, single samples far from both neighbours: {', '.join(affected)}."]
+        return [
+            f"Outliers, single samples far from both neighbours: {', '.join(affected)}; N includes "
+            "them."
+        ]
     return []
 
 

@@ -111,8 +111,16 @@ def test_outliers_and_motion_are_named_with_the_axis():
     values[0, [100, 30_000]] += 500.0
     values[1, 20_000:30_000] += 200.0  # turns at 200 deg/h for 100 s
     text = "\n".join(describe_record(make_product(values)))
-    assert re.search(r"Outliers.*: x in 2 windows \(at most 1 in one\)", text)
+    assert re.search(r"Outliers.*: x in 2 windows \(at most 1 in one\); N includes them", text)
     assert re.search(r"more than twice the Earth rate: y in [23] windows", text)
+
+
+def test_outliers_get_no_advice_on_the_averaging_times():
+    values = white(60_000, 7)
+    values[100::1_000] += 500.0
+    text = "\n".join(describe_record(make_product(values)))
+    assert "these windows hold outliers, which no --fit-from removes" in text
+    assert "fit again" not in text
 
 
 def test_a_shorter_record_gets_a_shorter_window():
