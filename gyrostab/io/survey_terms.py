@@ -63,6 +63,9 @@ class _Magnitude(NamedTuple):
     status: Status
 
 
+#: Largest Allan deviation of a constant axis, over its mean: rounding errors.
+_ROUNDING = 1e-9
+
 # Groups of axes, or of pairs of a gyro axis and an axis of acceleration.
 _XY: _Groups = (("x", "y"),)
 _Z: _Groups = (("z",),)
@@ -219,6 +222,12 @@ def survey_terms(
     ]
     if all(math.isnan(term.value) for term in terms if term.unit != "deg/h/g"):
         silent = [axis for axis, walk in magnitudes["walk"].items() if math.isnan(walk.value)]
+        constant = [axis for axis in silent if _is_constant(product.sel(axis=axis))]
+        if constant:
+            raise SchemaError(
+                f"axis {', '.join(constant)} is constant: its sensor is dead, or its column the "
+                "wrong one; make the product again without it (--axis names the axes to analyse)"
+            )
         raise SchemaError(
             f"no window of the product observes or limits N of axis {', '.join(silent)}; make the "
             "product again with a longer --window, or without that axis (--axis)"
@@ -230,6 +239,12 @@ def survey_terms(
         _describe_origin(product, times, statistic),
         (_CONFIRM, *_make_notes(product, terms, times["section"], content)),
     )
+
+
+def _is_constant(part: xr.Dataset) -> bool:
+    """Check whether the values of an axis differ by no more than rounding errors."""
+    rounding = (_ROUNDING * float(np.abs(part["window_mean"]).max())) ** 2
+    return float(part["avar"].max()) <= rounding
 
 
 def _make_term(

@@ -153,6 +153,9 @@ def test_axis_that_shows_nothing_is_named():
     product["observable"] = product["observable"].where(product["axis"] == "x", 0)
     with pytest.raises(SchemaError, match=r"limits N of axis y; .*without that axis"):
         survey_terms(product)
+    product["avar"] = product["avar"].where(product["axis"] == "x", 0.0)
+    with pytest.raises(SchemaError, match=r"^axis y is constant: .* without it \(--axis"):
+        survey_terms(product)
 
 
 @pytest.mark.parametrize(
