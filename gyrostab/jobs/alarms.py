@@ -126,7 +126,10 @@ def check_alarms(alarms: Sequence[Alarm], window: Mapping[str, Any]) -> None:
             continue
         if alarm.name not in window["channels"]:
             known_names = ", ".join([*_UNITS, *window["channels"]])
-            raise OptionError(f"--alarm {alarm.text!r}: {alarm.name} is not one of {known_names}")
+            raise OptionError(
+                f"--alarm {alarm.text!r}: {alarm.name} is not one of {known_names}; a channel has "
+                "the name that it has in the product, not that of its column"
+            )
         units = window["channels"][alarm.name][1]
         if _find_unit(alarm.unit, units) is None:
             raise OptionError(

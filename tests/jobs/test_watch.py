@@ -298,7 +298,7 @@ def test_alarms_that_cannot_be_read(text, says):
     ("text", "says"),
     [
         ("z:misfit>3", "there is no axis z"),
-        ("pressure>3 Pa", "is not one of Q, N"),
+        ("pressure>3 Pa", "is not one of Q, N.*the name that it has in the product"),
         ("temperature>3 V", "in degree_Celsius; write temperature>3 degree_Celsius, or"),
         ("temperature>3 parsec", "in degree_Celsius"),
     ],

@@ -49,7 +49,7 @@ def watch(
         Report when a limit is exceeded, and when it no longer is: "N>0.01 deg/sqrt(h)" (or Q, B,
         K, R),
         "x:N>0.01 deg/sqrt(h)" for one axis, misfit>3 (chi2/dof), "loss>5 %" (missing samples),
-        "temperature>125 degC" (a channel). Repeat for more.
+        "temperature>125 degC" (a channel, by its name in the product). Repeat for more.
     lateness
         How long a window waits for rows that come out of order: 10s. Rows that come even later
         are still placed, and the windows that they change are computed again.
