@@ -28,6 +28,7 @@ from gyrostab.time.stamps import format_stamp, to_nanoseconds
 #: rate may be wrong if many samples are missing.
 _UNCERTAIN_SIGMA, _MANY_SHARE = 0.3, 0.05
 _IF_HIGHER = "; if many samples are missing, the sampling rate may be higher: give it with --rate"
+_MAX_ZONE_HOURS = 14  # largest offset of local time from UTC
 _MAX_NAMED = 5  # events of one kind that are listed one by one
 #: Rows of which the steps of angles are taken, and the least number.
 _STEP_ROWS, _MIN_STEP_ROWS = 2**14, 100
@@ -50,12 +51,27 @@ def describe_channels(log: xr.Dataset) -> list[str]:
                 if len(stamps)
                 else "0 values"
             )
-            advice = "check its time column, its unit and --epoch"
+            advice = _find_zone(stamps, start, end) or "check its time column, its unit and --epoch"
             notes.append(
                 f"channel {name}: none of its {of}, lies within the log, "
                 f"{_format_span(start, end)}; {advice}"
             )
     return notes
+
+
+def _find_zone(stamps: NDArray[np.datetime64], start: np.datetime64, end: np.datetime64) -> str:
+    """Ask for the time zone if a shift by whole hours places stamps within a log; "" otherwise."""
+    if not len(stamps):
+        return ""
+    hour = np.timedelta64(1, "h")
+    shift = round(float((stamps.min() - start) / hour))
+    moved = stamps - shift * hour
+    if not 1 <= abs(shift) <= _MAX_ZONE_HOURS or not ((moved >= start) & (moved <= end)).any():
+        return ""
+    return (
+        f"it begins about {_count_of(abs(shift), 'hour')} {'late' if shift > 0 else 'early'}: is "
+        "one of the files in local time? If so, write its offset from UTC into the stamps (-05:00)"
+    )
 
 
 def describe_angles(raw: xr.Dataset) -> list[str]:

@@ -372,20 +372,21 @@ def test_rows_of_a_single_run_are_returned_unchanged():
     )
 
 
-def test_channel_of_another_day_is_noted():
+def test_channel_of_another_day_or_zone_is_noted():
     raw = raw_log(stamps_of(np.arange(100), 10.0))
-    for day, is_noted in ((0, False), (3, True)):
-        stamps = raw.time.values[:5] + np.timedelta64(day, "D")
+    for hours, says in (
+        (0, ""),
+        (72, "check its time column"),
+        (-5, "about 5 hours early: is one"),
+    ):
+        stamps = raw.time.values[:5] + np.timedelta64(hours, "h")
         other = raw.assign_coords(time_temperature=("time_temperature", stamps)).assign(
             temperature=("time_temperature", np.full(5, 20.0), {"units": "degree_Celsius"})
         )
-        assert (
-            any(
-                "channel temperature: none of its 5 values" in note
-                for note in regularise(other).attrs["notes"]
-            )
-            is is_noted
-        )
+        notes = regularise(other).attrs["notes"]
+        named = [note for note in notes if "channel temperature: none of its 5 values" in note]
+        assert len(named) == (1 if says else 0)
+        assert all(says in note for note in named)
 
 
 def test_notes_on_the_whole_record_do_not_name_one_of_its_files(tmp_path):
