@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
-from cyclopts import CycloptsError
+from cyclopts import CycloptsError, UnusedCliTokensError
 
 from gyrostab.cli.options import read_toml
 from gyrostab.errors import SYSTEM_ERRNOS, GyrostabError, OptionError
@@ -122,8 +122,24 @@ def print_error(text: str, code: int) -> int:
     return code
 
 
+def _join_duration(error: UnusedCliTokensError) -> str:
+    """Advise to write ``--window 2min`` if the number stands apart from its unit; "" otherwise."""
+    tokens, unused = error.root_input_tokens or [], error.unused_tokens or []
+    for option, number, unit in zip(tokens, tokens[1:], tokens[2:], strict=False):
+        if (
+            option.startswith("--")
+            and unit in unused
+            and re.fullmatch(r"[\d.]+", number)
+            and unit.isalpha()
+        ):
+            return f"write {option} {number}{unit}"
+    return ""
+
+
 def describe_error(error: Exception) -> int:
     """Print an exception as one message and return the exit code."""
+    if isinstance(error, UnusedCliTokensError) and (joined := _join_duration(error)):
+        return print_error(f"{joined}, without a blank: a duration is one word", 2)
     if isinstance(error, CycloptsError):
         return print_error(f"{error} See gyrostab --help, or the command's own --help.", 2)
     if isinstance(error, GyrostabError):

@@ -188,6 +188,10 @@ BAD_INPUT = {
         _without_stamps("--rate", "1", "--start", "2262-04-11T23:47:10"),
         "years 1678 to 2262",
     ),
+    "duration in two words": (
+        _bad_log("--window", "2", "min"),
+        "write --window 2min, without a blank",
+    ),
     "no worker": (_bad_log("--workers", "0"), "--workers"),
 }
 
