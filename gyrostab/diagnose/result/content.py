@@ -31,20 +31,25 @@ SCHEMA = "gyrostab.diagnosis/1"
 
 def _check_time(text: str) -> str:
     try:
-        np.datetime64(text.removesuffix("Z"))
+        is_time = not np.isnat(np.datetime64(text.removesuffix("Z")))
     except ValueError:
-        raise ValueError("expected a time in ISO 8601") from None
+        is_time = False
+    if not is_time:
+        raise ValueError("expected a time in ISO 8601")
     return text
 
 
-Time = Annotated[
-    str, AfterValidator(_check_time), WithJsonSchema({"type": "string", "format": "date-time"})
-]
+_TIME_SCHEMA = {"type": "string", "format": "date-time", "pattern": "^[0-9]{4}"}
+Time = Annotated[str, AfterValidator(_check_time), WithJsonSchema(_TIME_SCHEMA)]
 Span = Annotated[list[Time], Field(min_length=2, max_length=2)]
 
 
+NotNegative = Annotated[float, Field(ge=0.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
 class _Table(BaseModel):
-    model_config = ConfigDict(strict=True, extra="allow")
+    model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
 
 
 class Recording(_Table):
@@ -54,16 +59,16 @@ class Recording(_Table):
     axes: list[str]
     start: Time
     end: Time
-    sampling_rate_hz: float
+    sampling_rate_hz: Annotated[float, Field(gt=0.0)]
     channels: list[str]
-    missing_share: float
+    missing_share: Share
 
 
 class NoiseEntry(_Table):
     """A noise coefficient of an axis; null: the record does not determine it."""
 
     value: float
-    stderr: float | None
+    stderr: NotNegative | None
     unit: str
 
 
@@ -92,10 +97,10 @@ class Mismatch(_Table):
     axes: list[str]
     start: Time
     end: Time
-    tau_min_s: float | None
-    tau_max_s: float | None
+    tau_min_s: NotNegative | None
+    tau_max_s: NotNegative | None
     ratio: float | None
-    p_value: Annotated[float, Field(ge=0.0, le=1.0)]
+    p_value: Share
     explained_by: list[str]
     statement: str
 
@@ -104,7 +109,7 @@ class Size(_Table):
     """A fitted parameter of an effect."""
 
     value: float | None
-    stderr: float | None
+    stderr: NotNegative | None
     low: float | None
     high: float | None
     unit: str
@@ -114,7 +119,7 @@ class HeldOutGain(_Table):
     """What an effect gains on held-out data."""
 
     nats: float
-    stderr: float | None
+    stderr: NotNegative | None
     threshold: float
 
 
@@ -128,7 +133,7 @@ class NamedEffect(_Table):
     parameters: dict[str, Size]
     held_out_gain: HeldOutGain
     alternatives: list[str]
-    probability: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    probability: Share | None = None
     family: str | None = None
     statement: str
 
@@ -160,13 +165,13 @@ class UnusedChannel(_Table):
 class HeldOut(_Table):
     """Evidence on held-out data."""
 
-    blocks: int
+    blocks: Annotated[int, Field(ge=0)]
     log_likelihood_gain: float | None
-    stderr: float | None
-    misfit_before: float | None
-    misfit_after: float | None
-    coverage95_before: float | None
-    coverage95_after: float | None
+    stderr: NotNegative | None
+    misfit_before: NotNegative | None
+    misfit_after: NotNegative | None
+    coverage95_before: Share | None
+    coverage95_after: Share | None
     forecast_gain: float | None
 
 
@@ -177,7 +182,7 @@ class Content(_Table):
     recording: Recording
     baseline: Baseline
     verdict: Verdict
-    false_alarm_level: float
+    false_alarm_level: Share
     settings: dict[str, float] = {}
     mismatches: list[Mismatch]
     effects: list[NamedEffect]
@@ -186,7 +191,7 @@ class Content(_Table):
     rejected: list[Rejected] = []
     unused_channels: list[UnusedChannel] = []
     held_out: HeldOut
-    seconds: float
+    seconds: NotNegative
 
     @model_validator(mode="after")
     def _check_references(self) -> Content:
@@ -230,5 +235,11 @@ def check_diagnosis(content: Mapping[str, Any]) -> None:
         raise SchemaError(f"diagnosis: {message}") from invalid
 
 
+def make_schema() -> dict[str, Any]:
+    """Make the JSON Schema of the file."""
+    dialect = "https://json-schema.org/draft/2020-12/schema"
+    return {"$schema": dialect, **Content.model_json_schema()}
+
+
 if __name__ == "__main__":
-    print(json.dumps(Content.model_json_schema(), indent=1))
+    print(json.dumps(make_schema(), indent=1))

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gyrostab.diagnose.result.content import VERDICTS, Content, check_diagnosis
+from gyrostab.diagnose.result.content import VERDICTS, check_diagnosis, make_schema
 from gyrostab.diagnose.result.diagnosis import Diagnosis, effect_table, model_text, plain
 from gyrostab.diagnose.result.record_text import summary
 from gyrostab.diagnose.result.text import (
@@ -58,7 +58,7 @@ def test_content_made_by_hand_passes_the_check():
 def test_published_json_schema_is_that_of_the_models_and_accepts_a_diagnosis():
     path = Path(__file__).resolve().parents[3] / "docs" / "diagnosis.schema.json"
     published = json.loads(path.read_text(encoding="utf-8"))
-    assert published == Content.model_json_schema()
+    assert published == make_schema()
     jsonschema.validate(json.loads(diagnosis().to_json()), published)
     with pytest.raises(jsonschema.ValidationError, match="fine"):
         jsonschema.validate({**content(), "verdict": "fine"}, published)
@@ -124,6 +124,12 @@ def test_missing_keys_and_wrong_types_are_errors(place: tuple[Any, ...]):
         ),
         (lambda c: c["mismatches"][1].update(id=1), "are not unique"),
         (lambda c: c["mismatches"][0].update(start="yesterday"), "expected a time in ISO 8601"),
+        (lambda c: c["recording"].update(start="NaT"), "start is 'NaT', expected a time in ISO"),
+        (lambda c: c["recording"].update(end=""), "end is '', expected a time in ISO 8601"),
+        (lambda c: c["recording"].update(missing_share=-7.0), "missing_share is -7.0"),
+        (lambda c: c["recording"].update(sampling_rate_hz=np.inf), "sampling_rate_hz is inf"),
+        (lambda c: c["held_out"].update(blocks=-1), "blocks is -1"),
+        (lambda c: c["held_out"].update(stderr=np.nan), "held_out.stderr is nan"),
         (lambda c: c.update(unexplained=[7]), "mismatch 7"),
         (lambda c: c["baseline"].update(source="guess"), "'guess'"),
         (lambda c: c["effects"][0]["parameters"]["white"].pop("low"), "white.low"),
