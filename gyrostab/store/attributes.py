@@ -40,11 +40,11 @@ JSON_NAMES = "json_attributes"
 # one without an error, so none passes.
 _SAFE_UNIT_NAMES = (
     "degree_Celsius|standard_free_fall|degree|hour|microradian|radian|"
-    "s|m|K|V|W|Pa|T|uT|Hz|kg|percent"
+    "s|m|K|V|W|Pa|T|uT|Hz|kg|percent|"
+    "ms|min|h|mm|cm|km|ft|L|mL|N|kN|bar|mbar|hPa|kPa|MPa|psi|A|mA|mV|kV|mW|kW|ohm|mT|nT|kHz|rpm"
 )
-_SAFE_UNIT = re.compile(
-    rf"(?:{_SAFE_UNIT_NAMES})(?:-?[1-9])?(?: (?:{_SAFE_UNIT_NAMES})(?:-?[1-9])?)*"
-)
+_FACTOR = rf"(?:{_SAFE_UNIT_NAMES})(?:\^?-?[1-9])?"
+_SAFE_UNIT = re.compile(rf"{_FACTOR}(?:(?: {_FACTOR})*|/(?:{_SAFE_UNIT_NAMES})(?:\^?[1-9])?)")
 
 
 def encode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ import contextlib
 import json
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from gyrostab.errors import SchemaError
@@ -172,6 +173,9 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
         if name in stored.coords or name in bounds:
             opened = opened.load()
         opened.attrs = decode_attributes(dict(opened.attrs))
+        for flags in {"flag_values", "flag_masks"} & opened.attrs.keys():  # Zarr holds lists
+            with contextlib.suppress(OverflowError, TypeError, ValueError):  # damaged
+                opened.attrs[flags] = np.array(opened.attrs[flags], opened.dtype, ndmin=1)
         opened.dims = tuple(dims.get(dim, dim) for dim in opened.dims)
         variables[name] = opened.transpose(*_memory_order(opened.dims))
     small_coords = xr.Coordinates(

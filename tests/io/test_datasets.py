@@ -26,6 +26,7 @@ from gyrostab.io.opening import open_dataset, open_log, open_product, open_surfa
 from gyrostab.noise import LAWS, TERMS, model_avar
 from gyrostab.schema import VARIABLES, attributes
 from gyrostab.store import read, write
+from gyrostab.store.attributes import encode_attributes
 from gyrostab.time.grid import TimeGridIndex, grid_times, time_coordinate
 from gyrostab.units import INNER
 from tests.support import synthetic
@@ -186,6 +187,8 @@ def test_stored_coefficient_is_the_allan_deviation_at_its_reading_point(files, s
         "degree/sqrt(hour)",
         "0.1 arcsec/s",
         "K-1.5",
+        "W/m K",
+        "m/s-1",
     ],
 )
 def test_a_unit_that_udunits_refuses_or_misreads_is_not_written_as_units(tmp_path, units):
@@ -195,6 +198,54 @@ def test_a_unit_that_udunits_refuses_or_misreads_is_not_written_as_units(tmp_pat
         assert "units" not in file["it"].ncattrs()
         assert file["it"].source_units == units
     assert open_dataset(path)["it"].attrs["units"] == units
+
+
+@pytest.mark.parametrize(("write", "name"), [(to_netcdf, "f.nc"), (to_zarr, "f.zarr")])
+def test_flag_values_are_an_array_of_the_type_of_the_variable(tmp_path, write, name):
+    attrs = {"flag_values": np.arange(2, dtype=np.int8), "flag_meanings": "no yes"}
+    frame = xr.Dataset({"it": ("time", np.ones(2, np.int8), attrs)})
+    write(frame, tmp_path / name)
+    flags = open_dataset(tmp_path / name)["it"].attrs["flag_values"]
+    assert isinstance(flags, np.ndarray)
+    assert (flags.dtype, flags.tolist()) == (np.int8, [0, 1])
+
+
+@pytest.mark.parametrize(
+    ("units", "reference", "factor"),
+    [
+        ("bar", "Pa", 1e5),
+        ("mbar", "Pa", 100.0),
+        ("hPa", "Pa", 100.0),
+        ("kPa", "Pa", 1e3),
+        ("MPa", "Pa", 1e6),
+        ("psi", "Pa", 6894.757),
+        ("m/s", "m s-1", 1.0),
+        ("m/s^2", "m s-2", 1.0),
+        ("km/h", "m s-1", 1 / 3.6),
+        ("L/min", "m3 s-1", 1e-3 / 60.0),
+        ("mL", "m3", 1e-6),
+        ("ms", "s", 1e-3),
+        ("mm", "m", 1e-3),
+        ("cm", "m", 1e-2),
+        ("ft", "m", 0.3048),
+        ("kN", "kg m s-2", 1e3),
+        ("N/m", "kg s-2", 1.0),
+        ("mV", "V", 1e-3),
+        ("kV", "V", 1e3),
+        ("A", "W V-1", 1.0),
+        ("mA", "W V-1", 1e-3),
+        ("ohm", "V2 W-1", 1.0),
+        ("mW", "W", 1e-3),
+        ("kW", "W", 1e3),
+        ("mT", "T", 1e-3),
+        ("nT", "T", 1e-9),
+        ("kHz", "s-1", 1e3),
+        ("rpm", "radian s-1", np.pi / 30.0),
+    ],
+)
+def test_units_of_other_channels_are_written_as_udunits_reads_them(units, reference, factor):
+    assert encode_attributes({"units": units}) == {"units": units}
+    assert cf_units.Unit(units).convert(1.0, cf_units.Unit(reference)) == pytest.approx(factor)
 
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
