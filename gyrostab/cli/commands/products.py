@@ -162,12 +162,12 @@ def export(
     /,
     *,
     output: Output,
-    format: Literal["iscwsa", "kalibr", "zarr"],
+    format: Literal["csv", "iscwsa", "kalibr", "zarr"],
     log: Annotated[Path | None, Parameter(metavar="LOG.nc")] = None,
     survey: Survey = Survey(),
     common: Common = Common(),
 ) -> None:
-    """Export a product to other programs: survey error models, YAML for Kalibr and ROS, or Zarr.
+    """Export a product: as CSV, a survey error model, YAML for Kalibr and ROS, or Zarr.
 
     Example: gyrostab export product.nc -o imu.yaml --format kalibr
 
@@ -179,9 +179,10 @@ def export(
     output
         File or, for zarr, folder to write.
     format
-        iscwsa: gyro terms of an ISCWSA tool error model, as a table (.csv), as JSON for welleng
-        (.json) or as a WITSML ToolErrorModel (.xml), to be confirmed by a survey engineer. kalibr:
-        N, K and B in radians, for the worst axis and for each axis. zarr: the whole product.
+        csv: a table for spreadsheets, with a row for each window and axis. iscwsa: gyro terms of an
+        ISCWSA tool error model, as a table (.csv), as JSON for welleng (.json) or as a WITSML
+        ToolErrorModel (.xml), to be confirmed by a survey engineer. kalibr: N, K and B in radians,
+        for the worst axis and for each axis. zarr: the whole product.
     log
         Log of the product, for kalibr: adds the noise of the channels accel_x, accel_y and accel_z.
     """
@@ -189,10 +190,12 @@ def export(
     from gyrostab.io.kalibr import to_kalibr
     from gyrostab.io.opening import open_log, open_product
     from gyrostab.io.survey_files import SUFFIXES, to_iscwsa
+    from gyrostab.io.window_table import to_csv
     from gyrostab.jobs.fleet_table import open_fleet
     from gyrostab.store.output import check_output
 
     writers: dict[str, tuple[Any, list[str]]] = {
+        "csv": (to_csv, [".csv"]),
         "iscwsa": (to_iscwsa, list(SUFFIXES)),
         "kalibr": (to_kalibr, [".yaml", ".yml"]),
         "zarr": (to_zarr, [".zarr"]),
