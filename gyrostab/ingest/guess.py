@@ -24,6 +24,7 @@ from gyrostab.ingest.columns.headers import (
     TEMPERATURE_PATTERN,
     TIME_PATTERN,
     is_time_unit,
+    is_unit,
     is_unit_of,
 )
 from gyrostab.ingest.columns.stamps import parse_time_unit
@@ -73,6 +74,8 @@ _TIME_UNIT_PATTERNS = (
 _UNITS = ("s", "ms", "us", "ns")
 #: Unix time between 2001 and 2033 is 1 to 2 of these [s].
 _EPOCH_S = 1e9
+#: Unit of the dates of spreadsheets, and their values in the years 1968 to 2119.
+_SERIAL_DAYS, _SERIAL_RANGE = "days since 1899-12-30", (25_000.0, 80_000.0)
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,7 @@ def guess_columns(
     reasons: list[str] = []
     warnings: list[str] = []
     time, time_unit = (
-        (None, None) if inspection.time is not None else _guess_time(inspection, reasons)
+        (None, None) if inspection.time is not None else _guess_time(inspection, reasons, warnings)
     )
     if inspection.date_spans_s:
         spans = sorted(inspection.date_spans_s.items(), key=lambda span: span[1])
@@ -131,6 +134,12 @@ def guess_columns(
             else f"--rate {assumed:g} is an assumption, because the file has no time column: use "
             "the true rate instead"
         )
+        warnings += [
+            f"{column.key!r} rises from row to row in {column.unit}, which is not a unit of time: "
+            "if the log is over depth, export it over time"
+            for column in inspection.columns
+            if column.unit and not is_unit(column.unit) and _rises(column, inspection)
+        ]
     sampling = (
         rate
         or assumed
@@ -152,16 +161,17 @@ def guess_columns(
             "no column looks like a gyro; if one is, name it: --map NAME=gyro_x --unit gyro=deg/s"
         )
     axis_keys = {column.key for column in axes.values()}
-    temperature = next(
-        (c for c in inspection.columns if c.key not in axis_keys and _is_temperature(c)), None
-    )
+    temperatures = [
+        c for c in inspection.columns if c.key not in axis_keys and _is_temperature(c)
+    ]
+    is_named = any(column.quantity == "temperature" for column in inspection.columns)
     return Guess(
         axes,
         unit,
         time,
         time_unit,
         assumed,
-        temperature,
+        temperatures[0] if len(temperatures) == 1 and not is_named else None,
         tuple(reasons),
         tuple(warnings),
         sampling,
@@ -190,18 +200,22 @@ def _unit_seconds(unit: str | None) -> float:
     return float(parse_time_unit(unit or "s").ns) / 1e9
 
 
+def _rises(column: ColumnInspection, inspection: FileInspection) -> bool:
+    """Return whether a column rises from row to row, as time does."""
+    return (
+        column.rows >= max(2, 0.5 * inspection.rows)
+        and column.rising >= 0.5
+        and column.rising + column.held >= 0.95
+        and column.pace * MAX_RATE_HZ >= 1  # else too fast in any unit
+    )
+
+
 def _guess_time(
-    inspection: FileInspection, reasons: list[str]
+    inspection: FileInspection, reasons: list[str], warnings: list[str]
 ) -> tuple[ColumnInspection | None, str | None]:
     best: tuple[float, ColumnInspection, str, str] | None = None
     for column in inspection.columns:
-        if (
-            column.rows < 2
-            or column.rows < 0.5 * inspection.rows
-            or column.rising < 0.5
-            or column.rising + column.held < 0.95
-            or not column.pace * MAX_RATE_HZ >= 1  # too fast in any unit
-        ):
+        if not _rises(column, inspection):
             continue
         low = column.key.lower()
         named = bool(TIME_PATTERN.match(low) or _TIME_WORD.search(low))
@@ -210,7 +224,9 @@ def _guess_time(
             and abs(column.pace - 1.0) < 1e-6
             and abs(column.std - inspection.rows / math.sqrt(12)) < 0.1 * inspection.rows
         )
-        if not named and (counter or _COUNTER_WORD.search(low)):
+        written = column.unit or "1"
+        has_other_unit = not (is_time_unit(written) or is_unit_of(written, ("number",)))
+        if not named and (counter or has_other_unit or _COUNTER_WORD.search(low)):
             continue
         unit, reason = _time_unit(column)
         score = 2.0 * named + ("name" in reason) - 0.1 * _rate_distance(column, unit)
@@ -222,6 +238,11 @@ def _guess_time(
     reasons.append(
         f"{column.key!r} is the time, as it rises from row to row; in {unit}, by {reason}"
     )
+    if reason.startswith("the rate"):
+        warnings.append(
+            f'--unit "time={unit}" is an assumption, because of {reason}: if that is not the '
+            "sampling rate, use the true unit instead"
+        )
     return column, unit
 
 
@@ -236,7 +257,9 @@ def _time_unit(column: ColumnInspection) -> tuple[str, str]:
     for unit in _UNITS:
         if 1.0 <= column.first * _unit_seconds(unit) / _EPOCH_S < 2.0:
             return unit, "its size, that of Unix time"
-    unit = min(_UNITS, key=lambda unit: _rate_distance(column, unit))
+    low, high = _SERIAL_RANGE
+    units = (*_UNITS, _SERIAL_DAYS) if low <= column.first < high else _UNITS
+    unit = min(units, key=lambda unit: _rate_distance(column, unit))
     return unit, f"the rate of {1.0 / (column.pace * _unit_seconds(unit)):.4g} Hz that it gives"
 
 
@@ -385,8 +408,12 @@ def _mean_over_scatter(group: Sequence[ColumnInspection]) -> float:
 
 def _is_temperature(column: ColumnInspection) -> bool:
     return (
-        bool(TEMPERATURE_PATTERN.search(column.key.lower()))
-        and column.role != "channel"  # that has its name already
-        and column.std > 0
-        and (given_unit(column, "temperature") or name_unit(column, "temperature") is not None)
+        column.std > 0
+        and (
+            given_unit(column, "temperature")
+            or (
+                bool(TEMPERATURE_PATTERN.search(column.key.lower()))
+                and name_unit(column, "temperature") is not None
+            )
+        )
     )

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gyrostab.ingest.columns.headers import is_unit_of
+from gyrostab.ingest.columns.headers import is_unit, is_unit_of
 from gyrostab.ingest.inspect import ColumnInspection, FileInspection
 from gyrostab.units import HOUR, parse_unit
 
@@ -62,8 +62,11 @@ def guess_unit(
     warnings: list[str],
     *,
     angles: bool,
-) -> str:
-    """Guess the unit of the gyro columns, and add the reasons and warnings."""
+) -> str | None:
+    """Guess the unit of the gyro columns, and add the reasons and warnings.
+
+    None if the header gives a unit that is not known.
+    """
     group = list(axes.values())
     for column in group:
         named = name_unit(column, "rate")
@@ -78,10 +81,21 @@ def guess_unit(
             "true one in its place"
         )
         return "deg"
-    counts = [
-        *(c.unit for c in group if c.unit),
-        *(c.key for c in group if re.search(r"count|lsb|raw", c.key.lower())),
-    ]
+    units = [column.unit for column in group if column.unit]
+    unknown = next(
+        (
+            unit
+            for unit in units
+            if not (is_unit(unit) or is_unit_of(unit, ("number",)) or _names_counts(unit))
+        ),
+        None,
+    )
+    if unknown is not None:
+        warnings.append(
+            f"the unit {unknown!r} of the gyro is not known: give it with --unit gyro=deg/s"
+        )
+        return None
+    counts = units or any(_names_counts(column.key) for column in group)
     large = (
         inspection.summary.format == "miniseed"
         and max(max(abs(c.low), abs(c.high)) for c in group) > 10.0
@@ -107,6 +121,11 @@ def guess_unit(
         "data sheet"
     )
     return unit
+
+
+def _names_counts(text: str) -> bool:
+    """Return whether a unit or the name of a column is one of counts."""
+    return bool(re.search(r"count|lsb|raw", text.lower()))
 
 
 def rate_plausibility(

@@ -321,6 +321,55 @@ def test_order_of_dates_is_guessed_from_the_length_of_the_file(
     assert f"time={expected}" in next_command(capsys.readouterr().out)
 
 
+def test_an_index_of_depth_is_not_the_time(tmp_path: Path, capsys) -> None:
+    write(tmp_path / "log.csv", {"DEPT [FT]": 5000 + TIME, "GX [deg/s]": GX})
+    assert call("scan", tmp_path / "log.csv") == 0
+    shown = capsys.readouterr().out
+    assert "check: 'DEPT' rises from row to row in FT, which is not a unit of time" in shown
+    assert {"--rate", "100"} < set(next_command(shown))
+    assert "time" not in " ".join(next_command(shown))
+
+
+@pytest.mark.parametrize(
+    ("stamps", "unit"),
+    [(TIME, "s"), (TIME * 1e3, "ms"), (46145.9167 + TIME / 86400, "days since 1899-12-30")],
+)
+def test_unit_of_time_by_the_rate_is_to_be_checked(
+    tmp_path: Path, monkeypatch, capsys, stamps: NDArray[np.float64], unit: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    rows = [f"{stamp:.10f},{x}" for stamp, x in zip(stamps, GX, strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(["clock,gyro_x [deg/s]", *rows]) + "\n")
+    assert call("scan", "log.csv") == 0
+    shown = capsys.readouterr().out
+    assert f'check: --unit "time={unit}" is an assumption' in shown
+    assert f"time={unit}" in next_command(shown)
+    assert call(*next_command(shown), "--quiet-progress") == 0
+    capsys.readouterr()
+    with open_product("product.nc") as product:
+        first = product.time.values[0]
+    assert (first > np.datetime64("2026-05-03T21")) == unit.startswith("days")
+
+
+@pytest.mark.parametrize(
+    ("headers", "mapped"),
+    [
+        (("Board Temp [degC]",), "Board Temp=temperature [degC]"),
+        (("PROBE [degC]",), "PROBE=temperature [degC]"),
+        (("Temp_C", "Board [degC]"), None),
+        (("temperature [degC]", "Temp_C"), None),
+    ],
+)
+def test_the_only_temperature_is_mapped(
+    tmp_path: Path, capsys, headers: Sequence[str], mapped: str | None
+) -> None:
+    temperatures = {header: 20 + TIME for header in headers}
+    path = write(tmp_path / "log.csv", {"time [s]": TIME, "wx [deg/s]": GX, **temperatures})
+    assert call("scan", path) == 0
+    words = next_command(capsys.readouterr().out)
+    assert [word for word in words if "=temperature" in word] == ([mapped] if mapped else [])
+
+
 def test_unit_of_the_time_is_used_in_the_inspection(tmp_path: Path, capsys) -> None:
     path = write(tmp_path / "log.csv", {"time": TIME * 1e3, "wx": GX})
     call("scan", path, "--unit", "time=ms")
