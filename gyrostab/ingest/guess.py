@@ -154,16 +154,15 @@ def guess_columns(
     )
     unit = None
     if not all(given_unit(column, "angle" if angles else "rate") for column in group):
-        unit = guess_unit(inspection, axes, sampling, reasons, warnings, angles=angles)
+        usual = sampling if sampling > 0 else TYPICAL_RATE_HZ
+        unit = guess_unit(inspection, axes, usual, reasons, warnings, angles=angles)
     guessed_kind = _guess_kind(group, reasons, warnings) if angles and kind is None else None
     if not axes:
         warnings.append(
             "no column looks like a gyro; if one is, name it: --map NAME=gyro_x --unit gyro=deg/s"
         )
     axis_keys = {column.key for column in axes.values()}
-    temperatures = [
-        c for c in inspection.columns if c.key not in axis_keys and _is_temperature(c)
-    ]
+    temperatures = [c for c in inspection.columns if c.key not in axis_keys and _is_temperature(c)]
     is_named = any(column.quantity == "temperature" for column in inspection.columns)
     return Guess(
         axes,
@@ -407,13 +406,10 @@ def _mean_over_scatter(group: Sequence[ColumnInspection]) -> float:
 
 
 def _is_temperature(column: ColumnInspection) -> bool:
-    return (
-        column.std > 0
-        and (
-            given_unit(column, "temperature")
-            or (
-                bool(TEMPERATURE_PATTERN.search(column.key.lower()))
-                and name_unit(column, "temperature") is not None
-            )
+    return column.std > 0 and (
+        given_unit(column, "temperature")
+        or (
+            bool(TEMPERATURE_PATTERN.search(column.key.lower()))
+            and name_unit(column, "temperature") is not None
         )
     )

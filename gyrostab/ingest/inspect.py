@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +14,9 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, GyrostabError
 from gyrostab.ingest.columns.dates import DAY_FIRST, EITHER_FIRST, MONTH_FIRST
+from gyrostab.ingest.columns.plan_time import UNREADABLE
 from gyrostab.ingest.files import read_file, scan_file
+from gyrostab.ingest.formats.text import read_head
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 
 #: Largest number of columns to inspect; a sensor log has tens of them.
@@ -95,10 +98,12 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     names = {f"column_{place}": column for place, column in enumerate(data_columns[:MAX_COLUMNS])}
     chosen = {column.key: f"{name} [1]" for name, column in names.items()}
     chosen.update({column.key: "-" for column in data_columns[MAX_COLUMNS:]})
-    has_unit = time is not None and time.unit not in (None, "ISO 8601")
+    has_unit = time is not None and time.unit not in (None, "ISO 8601", *UNREADABLE)
     unit = {"time": str(time.unit)} if time is not None and has_unit else {}
-    if time is not None and (time.key != "time" or "time" in options.map):
-        chosen[time.key] = "time"  # else stamps of the format, not a named column
+    is_column = time is not None and (time.key != "time" or time.unit in UNREADABLE)
+    if time is not None and (is_column or "time" in options.map):
+        # else stamps of the format, not a named column
+        chosen[time.key] = "-" if time.unit in UNREADABLE else "time"
     reading = replace(
         options,
         map=chosen,
@@ -113,7 +118,7 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     if time is not None and time.unit == EITHER_FIRST:
         spans = {
             order: _span_s(path, replace(reading, unit={"time": order}))
-            for order in (DAY_FIRST, MONTH_FIRST)
+            for order in sorted((DAY_FIRST, MONTH_FIRST), reverse=_has_half_days(path))
         }
         reading = replace(reading, unit={"time": min(spans, key=spans.__getitem__)})
     try:
@@ -131,6 +136,11 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     notes = [f"{further} further columns are not inspected"] if further > 0 else []
     rows = max((log.sizes[str(log[name].dims[0])] for name in names if name in log), default=0)
     return FileInspection(summary, tuple(columns), rows, time, rates["row"], tuple(notes), spans)
+
+
+def _has_half_days(path: Path) -> bool:
+    """Return whether a text file begins with times such as ``10:00 PM``, of the United States."""
+    return bool(re.search(r":\d\d\s*[AaPp][Mm]\b", read_head(path)))
 
 
 def _span_s(path: Path, options: ReadOptions) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -152,6 +153,14 @@ def test_date_of_two_meanings_needs_the_order(tmp_path: Path) -> None:
         assert stamps_of(raw)[0] == np.datetime64(f"{first}T08:00:00")
     path.write_text(path.read_text().replace("time", "time [MM/DD/YYYY hh:mm:ss]"))
     assert stamps_of(read_log(path))[0] == np.datetime64("2026-05-01T08:00:00")
+
+
+@pytest.mark.parametrize("header", ["time,gyro_x [deg/h]", "Zeit,gyro_x [deg/h]"])
+@pytest.mark.parametrize("options", [{}, {"unit": {"time": MONTH_FIRST}}])
+def test_name_of_a_zone_is_refused(tmp_path: Path, header: str, options: dict[str, Any]) -> None:
+    path = write(tmp_path / "log.csv", "%m/%d/%Y %H:%M:%S.%f CDT", header)
+    with pytest.raises(UnitError, match=r"CDT', with the name of a time zone; write the offset"):
+        read_log(path, **options)
 
 
 def test_times_of_day_alone_are_refused(tmp_path: Path) -> None:

@@ -16,6 +16,8 @@ YEAR_FIRST, DAY_FIRST, MONTH_FIRST = "YYYY/MM/DD", "DD/MM/YYYY", "MM/DD/YYYY"
 EITHER_FIRST = f"{DAY_FIRST} or {MONTH_FIRST}"
 #: In place of an order: times of day without a date.
 NO_DATE = "hh:mm:ss"
+#: In place of an order: dates that end with the name of a time zone.
+NAMED_ZONE = "date and time with the name of a zone"
 
 _CLOCK = r"(?P<hour>\d\d?):(?P<minute>\d\d)(?::(?P<second>\d\d)(?:[.,](?P<part>\d+))?)?"
 _ISO = re.compile(
@@ -28,6 +30,7 @@ _DATE = re.compile(
     rf"(?:[T,\s]\s*{_CLOCK}\s*(?P<half>[AaPp][Mm])?\s*(?P<zone>Z|[+-]\d\d(?::?\d\d)?)?)?\s*$"
 )
 _TIME_OF_DAY = re.compile(rf"^\s*{_CLOCK}\s*(?:[AaPp][Mm])?\s*$")
+_ZONE_NAME = re.compile(r"^(.*:\d\d(?:[.,]\d+)?(?:\s*[AaPp][Mm])?)\s*[A-Za-z][A-Za-z/_]+\s*$")
 _OFFSET = re.compile(r":\d\d(?:[.,]\d+)?\s*(?:Z|[+-]\d\d(?::?\d\d)?)\s*$")
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 
@@ -64,10 +67,22 @@ def is_time_of_day(text: str) -> bool:
     return bool(_TIME_OF_DAY.match(text))
 
 
+def names_zone(text: str) -> bool:
+    """Return whether a cell is a date and time that ends with the name of a time zone.
+
+    Examples
+    --------
+    >>> [names_zone(f"5/1/2026 8:00:00 {end}") for end in ("PM CDT", "PM", "Europe/Berlin", "Z")]
+    [True, False, True, False]
+    """
+    match = None if holds_date(text) else _ZONE_NAME.match(text)
+    return match is not None and holds_date(match[1])
+
+
 def find_order(cells: Iterable[str]) -> str | None:
     """Return the order of the parts of dates; None if they can be read in two ways.
 
-    It is `NO_DATE` if all cells are times of day.
+    It is `NO_DATE` if all cells are times of day, and `NAMED_ZONE` if one names a time zone.
 
     Examples
     --------
@@ -79,6 +94,8 @@ def find_order(cells: Iterable[str]) -> str | None:
     cells, pairs = list(cells), []
     if all(map(is_time_of_day, cells)):
         return NO_DATE
+    if any(map(names_zone, cells)):
+        return NAMED_ZONE
     for cell in cells:
         match = None if is_iso(cell) else _DATE.match(cell)
         if match and match["first"]:

@@ -7,6 +7,7 @@ from gyrostab.ingest.columns.dates import (
     DAY_FIRST,
     EITHER_FIRST,
     MONTH_FIRST,
+    NAMED_ZONE,
     NO_DATE,
     YEAR_FIRST,
     parse_order,
@@ -20,6 +21,9 @@ from gyrostab.ingest.columns.headers import (
 )
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_unit
+
+#: Orders of stamps that cannot be read.
+UNREADABLE = (NO_DATE, NAMED_ZONE)
 
 
 def find_time(plan: Plan, named: list[Header]) -> Header | None:
@@ -42,7 +46,7 @@ def find_time(plan: Plan, named: list[Header]) -> Header | None:
             if c.file.stamped
             and plan.rises(c)
             and not (c.mapped or c.preset)
-            and not (c.file.date_order == NO_DATE and plan.options.rate is not None)
+            and not (c.file.date_order in UNREADABLE and plan.options.rate is not None)
         ]
         reason = "it holds dates"
         if not time_columns:
@@ -112,6 +116,14 @@ def _is_clock(plan: Plan, column: Header) -> bool:
 
 def _date_order(plan: Plan, column: Header) -> str:
     """Return the order of day, month and year: from the user, the header, or the dates."""
+    if column.file.date_order == NAMED_ZONE:
+        plan.refuse(
+            UnitError,
+            f"the time column {column.header!r} holds {plan.word_in(column.source)!r}, with the "
+            "name of a time zone; write the offset from UTC in its place, for instance "
+            "2026-05-01T08:00:00-06:00 or 05/20/2026 8:00:00 AM -06:00",
+        )
+        return NAMED_ZONE
     names = [column.name, column.key, column.header, "time"]
     for key in filter(None, (plan.unit_key([name]) for name in names)):
         if order := parse_order(plan.options.unit[key]):
@@ -122,7 +134,8 @@ def _date_order(plan: Plan, column: Header) -> str:
         plan.refuse(
             UnitError,
             f"the time column {column.header!r} holds times of day without a date; write the date "
-            "before the time, in this column or in one to its left",
+            "before the time, in this column or in one to its left, or give rate and start: --map "
+            f'"{column.key}=-" --rate HZ --start 2026-05-01T08:00:00',
         )
     if order is None:
         plan.refuse(

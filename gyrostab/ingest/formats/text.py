@@ -22,11 +22,13 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.dates import (
     DAY_FIRST,
+    NAMED_ZONE,
     NO_DATE,
     find_order,
     has_offset,
     holds_date,
     is_time_of_day,
+    names_zone,
 )
 from gyrostab.ingest.columns.headers import FileColumn
 from gyrostab.ingest.columns.plan import Column, Plan
@@ -121,7 +123,7 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
     for place, header in enumerate(layout.headers):
         cells = [row[place] for row in rows]
         column = FileColumn(header, layout.units.get(place) or _duration_unit(cells))
-        if any(holds_date(cell) or is_time_of_day(cell) for cell in cells):
+        if any(holds_date(cell) or is_time_of_day(cell) or names_zone(cell) for cell in cells):
             column = replace(column, stamped=True, date_order=find_order(cells))
         columns.append(column)
     plan = plan_columns(
@@ -162,6 +164,8 @@ def _is_rising(layout: Layout, column: int) -> bool:
         steps = np.diff([float(from_fortran(cell.replace(",", "."))) for cell in cells])
     else:
         order = find_order(cells) or DAY_FIRST
+        if order == NAMED_ZONE:
+            return True
         if order == NO_DATE:
             cells = [f"1970-01-01 {cell}" for cell in cells]
         stamps = cells_to_ns(cells, None, 0, order)
