@@ -31,6 +31,33 @@ def has_note(raw: xr.Dataset, *words: str) -> bool:
 
 
 @pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ([-999.25] * 40, "in 40 of the first 40 rows; it is a common code for a missing value"),
+        ([*range(36), *[-9999] * 4], "far outside all other values; it is a common code"),
+        ([*range(36), *[-777] * 4], "far outside all other values; if that is a code"),
+        ([5.0] * 40, None),
+    ],
+)
+def test_codes_for_missing_values_are_named(
+    tmp_path: Path, values: list[float], words: str | None
+) -> None:
+    rows = [f"{n / 10},{value},{n % 7}" for n, value in enumerate(values)]
+    text = "\n".join(["time [s],gyro_x [deg/h],gyro_y [deg/h]", *rows])
+    raw = read_log(write(tmp_path, text))
+    assert has_note(raw, words or "code for a missing value") == (words is not None)
+
+
+def test_column_named_as_a_unit_of_rate_is_kept_as_the_rotation(tmp_path: Path) -> None:
+    path = write(tmp_path, "time [s],gyro_x [deg/h],RPM\n0,1,10\n1,2,20\n")
+    raw = read_log(path)
+    option = '--map "RPM=rotation_rate [RPM]"'
+    assert has_note(raw, option)
+    key, target = shlex.split(option)[1].split("=")
+    assert read_log(path, map={key: target}).rotation_rate.values.tolist() == [60.0, 120.0]
+
+
+@pytest.mark.parametrize(
     ("header", "split"),
     [
         ("Gyroscope x (deg/s)", ("Gyroscope x", "deg/s")),

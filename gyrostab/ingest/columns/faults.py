@@ -26,6 +26,8 @@ _CODE_ROWS = 2**18
 #: A code repeats, is farther from the other values than their range times this number, and the
 #: latter have at least so many different values, unlike the states of a switch.
 _MIN_CODE_REPEATS, _MIN_CODE_DISTANCE, _MIN_READINGS = 3, 3.0, 16
+#: Common codes for missing values in well logs.
+_COMMON_CODES = (-999.25, -9999.0)
 
 #: Row numbers within a block -> names of the rows for messages.
 Locate = Callable[[Sequence[int]], list[str]]
@@ -106,18 +108,29 @@ class Faults:
 
 
 def describe_codes(columns: Sequence[Column], values: Mapping[int, Any]) -> list[str]:
-    """Return notes on values that repeat far outside all others, as codes for missing do."""
+    """Return notes on codes for missing values.
+
+    They repeat far outside all other values, or are common codes and the only value.
+    """
     notes = []
     for column in columns:
         head = np.asarray(read_slice(values[column.source], 0, _CODE_ROWS), dtype=np.float64)
-        code = _find_code(head[np.isfinite(head)])
-        if code is not None:
-            number, written = int((head == code).sum()), (code - column.offset) / column.factor
-            notes.append(
-                f"{column.header!r} is {written:.10g} in {number} of the first {len(head)} "
-                "rows, far outside all other values; if that is a code for a missing value, "
-                "replace it by nan before the log is read"
-            )
+        readings = head[np.isfinite(head)]
+        code = _find_code(readings)
+        only = code is None and len(readings) and readings.min() == readings.max()
+        value = float(readings[0]) if only else code
+        if value is None:
+            continue
+        written = (value - column.offset) / column.factor
+        is_common = bool(np.isclose(written, _COMMON_CODES, rtol=1e-9).any())
+        if only and not is_common:
+            continue
+        notes.append(
+            f"{column.header!r} is {written:.10g} in {int((head == value).sum())} of the first "
+            f"{len(head)} rows{'' if only else ', far outside all other values'}; "
+            f"{'it is a common' if is_common else 'if that is a'} code for a missing value"
+            f"{':' if is_common else ','} replace it by nan before the log is read"
+        )
     return notes
 
 

@@ -17,6 +17,7 @@ from gyrostab.ingest.columns.headers import (
     distinct_columns,
     example_unit,
     free_name,
+    is_unit_of,
     split_header,
     stored_name,
 )
@@ -163,9 +164,10 @@ class Plan:
             name, quantity, _ = min(
                 self.unitless, key=lambda entry: entry[1] is None
             )  # a known quantity first
-            advice = (
-                f"keep one with a unit: --unit {shlex.quote(f'{name}={example_unit(quantity)}')}"
-            )
+            option = f"--unit {shlex.quote(f'{name}={example_unit(quantity)}')}"
+            if quantity is None and is_unit_of(name, ("rate",)):
+                option = f'--map "{name}=rotation_rate [{name}]"'
+            advice = f"keep one with a unit: {option}"
             self.notes.append(
                 "left out, as they carry no unit: "
                 f"{list_some([header for _, _, header in self.unitless], MAX_HEADERS)} ({advice})"
