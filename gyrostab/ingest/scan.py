@@ -111,7 +111,17 @@ class InspectedFile:
     guess: Guess
     options: dict[str, Any]
     row: dict[str, Any] | None  # row of the table, read with these options
-    error: str | None  # why these options do not read it
+    error: GyrostabError | None  # why these options do not read it, if there is a gyro
+
+    @property
+    def holds_channels(self) -> bool:
+        """Whether the file has stamps and channels but no gyro."""
+        columns = self.inspection.summary.columns
+        return (
+            not self.guess.axes
+            and self.inspection.time is not None
+            and any(column.role == "channel" for column in columns)
+        )
 
 
 @dataclass(frozen=True)
@@ -141,10 +151,11 @@ def scan_and_inspect(
             rows.append(_scan_one(path, reading))
         except GyrostabError as error:
             error.args = (str(error).removesuffix(scan_advice(path)),)
-            errors.append(error)
             inspected_file = _inspect_once(path, reading, inspected) if inspect else None
-            rows.append({"file": given_name(path), "odd": str(error)})
-            if inspected_file is not None:
+            failure = None if inspected_file is None or reading else inspected_file.error
+            errors.append(failure or error)
+            rows.append({"file": given_name(path), "odd": str(errors[-1])})
+            if inspected_file is not None and inspected_file.error is None:
                 rows[-1].update(format=inspected_file.inspection.summary.format)
                 rows[-1].update(
                     rows=inspected_file.inspection.rows if inspected_file.paths == [path] else None
@@ -204,7 +215,7 @@ def _try_guess(
     tries = [options]
     if "rate" not in options and math.isfinite(inspection.rate_hz):
         tries.append({**options, "rate": float(f"{inspection.rate_hz:.6g}")})
-    reason = "no column looks like a gyro"
+    failure: GyrostabError | None = None
     read: list[InspectedFile] = []
     for trial in tries if guess.axes else []:
         try:
@@ -212,11 +223,22 @@ def _try_guess(
                 InspectedFile([path], inspection, guess, trial, _scan_one(path, trial), None)
             )
         except GyrostabError as error:
-            reason = str(error)
+            failure = error
         if read and read[-1].row is not None and read[-1].row["missing_share"] < MAX_MISSING_SHARE:
             break
     best = min(read, key=lambda file: file.row["missing_share"] if file.row else 1.0, default=None)
-    return best or InspectedFile([path], inspection, guess, options, None, reason)
+    return best or InspectedFile([path], inspection, guess, options, None, failure)
+
+
+def add_channels(options: dict[str, Any], inspected: Sequence[InspectedFile]) -> dict[str, Any]:
+    """Return options that also read the channels of the files without a gyro."""
+    files = [file for file in inspected if file.holds_channels]
+    if not files:
+        return options
+    paths = [path for file in files for path in file.paths]
+    names = {key: name for file in files for key, name in file.options.get("map", {}).items()}
+    complete = {**options, "channel": [*options.get("channel", ()), *paths]}
+    return {**complete, "map": {**options.get("map", {}), **names}} if names else complete
 
 
 def _select_reading(options: dict[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from gyrostab.store.remote import given_name
+from gyrostab.time.stamps import format_stamp
 
 if TYPE_CHECKING:
     from gyrostab.ingest.scan import InspectedFile
@@ -53,7 +54,14 @@ def next_command(paths: Sequence[str | Path], options: dict[str, Any]) -> str:
 def print_scan(table: pd.DataFrame) -> None:
     """Print the table of `scan`: framed with notes below on a terminal, tab-separated otherwise."""
     if not sys.stdout.isatty():
-        table.to_csv(sys.stdout, sep="\t", index=False)
+        plain = table.copy()
+        for name in ("start", "end"):
+            plain[name] = [
+                None if pd.isna(stamp) else f"{format_stamp(stamp.value)}Z" for stamp in table[name]
+            ]
+        plain["missing_share"] = table["missing_share"].round(6)
+        counts = {"rows": "Int64", "gaps": "Int64"}
+        plain.astype(counts).to_csv(sys.stdout, sep="\t", index=False)
         return
     _print_framed(table)
     for _, row in table[table["odd"].fillna("") != ""].iterrows():
@@ -168,19 +176,23 @@ def _format_number(value: float) -> str:
     return f"{value:.6g}" if math.isfinite(value) else ""
 
 
-def print_inspection(inspected: InspectedFile) -> None:
-    """Print the columns of a file and the guess; in a pipe every line begins with ``#``."""
+def print_inspection(inspected: InspectedFile, shown: Collection[str]) -> None:
+    """Print the columns of a file and the guess; in a pipe every line begins with ``#``.
+
+    Notes that are `shown` elsewhere are left out.
+    """
     from gyrostab.ingest.columns.plan_roles import scan_advice
 
     rows = _inspection_rows(inspected)
     guess = inspected.guess
     advice = scan_advice(inspected.paths[0])
-    summary_notes = [note.removesuffix(advice) for note in inspected.inspection.summary.notes]
+    notes = inspected.row["notes"] if inspected.row else inspected.inspection.summary.notes
+    notes = [note.removesuffix(advice) for note in notes]
     lines = [
         *guess.reasons,
         *(f"check: {warning}" for warning in guess.warnings),
         *inspected.inspection.notes,
-        *(summary_notes if inspected.row is None else inspected.row["notes"]),
+        *(note for note in notes if note not in shown),
     ]
     if inspected.row is not None:
         read = inspected.row
@@ -188,8 +200,6 @@ def print_inspection(inspected: InspectedFile) -> None:
             f"read by this guess: {_format_span(read['span_s'])} at {read['rate_hz']:.6g} Hz, axes "
             f"{read['axes']}, {100 * read['missing_share']:.2f} % missing"
         )
-    if inspected.error is not None and guess.axes:
-        lines.append(f"not readable by this guess: {inspected.error}")
     name = given_name(inspected.paths[0])
     if not sys.stdout.isatty():
         print(f"# {name}: {len(rows)} columns, {inspected.inspection.rows} rows")

@@ -304,6 +304,14 @@ def test_dates_of_two_meanings_get_an_order_to_be_checked(
     assert call(*words, "--quiet-progress") == 0
 
 
+def test_half_days_point_to_the_order_of_the_united_states(tmp_path: Path, capsys) -> None:
+    stamps = pd.date_range("2026-05-03 22:00", periods=100, freq="1s")
+    rows = [f"{stamp:%m/%d/%Y %I:%M:%S %p},{x}" for stamp, x in zip(stamps, GX, strict=False)]
+    (tmp_path / "log.csv").write_text("\n".join(["time,gyro_x [deg/s]", *rows, ""]))
+    assert call("scan", tmp_path / "log.csv") == 0
+    assert "time=MM/DD/YYYY" in next_command(capsys.readouterr().out)
+
+
 @pytest.mark.parametrize(
     ("first", "order"),
     [("2026-03-07", "%m/%d/%Y"), ("2026-03-12", "%m/%d/%Y"), ("2026-07-03", "%d/%m/%Y")],
@@ -387,6 +395,82 @@ def test_file_without_a_gyro_is_inspected(tmp_path: Path, capsys) -> None:
     assert "next:" not in shown
     (tmp_path / "empty.csv").write_text("")
     assert call("scan", tmp_path / "empty.csv") == 2
+
+
+def test_file_that_no_guess_reads_ends_with_its_error(tmp_path: Path, capsys) -> None:
+    cells = np.where(np.arange(ROWS) % 5 < 3, "****", "1.5")
+    rows = "".join(f"{time},{cell}\n" for time, cell in zip(TIME, cells, strict=True))
+    for header in ("gyro_x [deg/h]", "wx"):
+        (tmp_path / "half.csv").write_text(f"time [s],{header}\n{rows}")
+        assert call("scan", tmp_path / "half.csv") == 2
+        shown = capsys.readouterr()
+        assert "# half.csv: 2 columns" in shown.out
+        assert "of 3000 rows are unreadable" in shown.err
+        assert (shown.out + shown.err).count("unreadable") == 1
+        assert "next:" not in shown.out
+
+
+def test_unknown_unit_of_the_gyro_gets_no_scale(tmp_path: Path, capsys) -> None:
+    path = write(tmp_path / "log.csv", {"time [s]": TIME, "gyro_x [furlong]": GX})
+    assert call("scan", path) == 2
+    shown = capsys.readouterr()
+    assert "the unit 'furlong' of the gyro is not known" in shown.out
+    assert "a count" not in shown.out
+    assert "unit 'furlong' is not known" in shown.err
+
+
+@pytest.mark.parametrize(
+    ("form", "message"),
+    [
+        ("%H:%M:%S.%f", '--map "TIME=-" --rate HZ --start'),
+        ("%m/%d/%Y %H:%M:%S.%f CDT", "name of a time zone"),
+    ],
+)
+def test_columns_of_a_file_with_unreadable_stamps_are_printed(
+    tmp_path: Path, capsys, form: str, message: str
+) -> None:
+    stamps = pd.date_range("2026-05-03 23:50", periods=200, freq="10ms").strftime(form)
+    rows = "".join(f"{stamp},{x}\n" for stamp, x in zip(stamps, GX, strict=False))
+    path = tmp_path / "log.csv"
+    path.write_text(f"TIME,wx\n{rows}")
+    assert call("scan", path) == 2
+    shown = capsys.readouterr()
+    assert any(line.endswith("\tgyro_x") for line in shown.out.splitlines())
+    assert message in shown.err
+    assert message not in shown.out
+    given = ["--map", "TIME=-", "--rate", "100", "--start", "2026-05-03T23:50"]
+    assert call("scan", path, *given, "--map", "wx=gyro_x", "--unit", "gyro=deg/s") == 0
+
+
+def test_file_of_channels_is_part_of_the_command(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "gyro.csv", {"time [s]": TIME, "gyro_x [deg/s]": GX})
+    write(tmp_path / "probe.csv", {"time [s]": TIME, "PROBE (degF)": 20 + TIME})
+    assert call("scan", "gyro.csv", "probe.csv") == 0
+    shown = capsys.readouterr()
+    assert "give it as --channel probe.csv" in shown.out
+    words = next_command(shown.err)
+    assert words[words.index("--channel") + 1] == "probe.csv"
+    assert call(*words, "--quiet-progress") == 0
+    capsys.readouterr()
+    with open_product("product.nc") as product:
+        assert "temperature" in product
+
+
+def test_the_table_in_a_pipe_has_one_form_of_time_and_rounded_shares(
+    tmp_path: Path, capsys
+) -> None:
+    rows = np.delete(np.arange(ROWS), np.arange(100, 107))
+    write(tmp_path / "a.csv", {"time [s]": TIME[rows], "gyro_x [deg/s]": GX[rows]})
+    write(tmp_path / "b.csv", {"time [s]": TIME + 0.25, "gyro_x [deg/s]": GX})
+    (tmp_path / "c.csv").write_text("")
+    assert call("scan", tmp_path / "*.csv") == 2
+    table = [line.split("\t") for line in capsys.readouterr().out.splitlines()]
+    starts, ends, shares, gaps = ([row[at] for row in table[1:]] for at in (2, 3, 10, 9))
+    assert starts == ["1970-01-01T00:00:00.000Z", "1970-01-01T00:00:00.250Z", ""]
+    assert ends == ["1970-01-01T00:00:29.990Z", "1970-01-01T00:00:30.240Z", ""]
+    assert shares == ["0.002333", "0.0", ""]
+    assert gaps == ["1", "0", ""]
 
 
 def test_files_with_the_same_columns_are_inspected_once(tmp_path: Path, capsys) -> None:

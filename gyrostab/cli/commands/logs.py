@@ -31,25 +31,26 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     logs
         One or more logs, in any supported format.
     """
-    from gyrostab.ingest.scan import scan_and_inspect
+    from gyrostab.ingest.scan import add_channels, scan_and_inspect
     from gyrostab.ingest.scan_output import next_command, print_inspection, print_next, print_scan
 
     options = reading.given()
     examined = scan_and_inspect(logs, **options)
     table = examined.table
     lost = table[table["format"].isna()]
-    if len(lost) == len(table):
-        raise examined.errors[0]
-    print_scan(table)
+    if len(lost) < len(table):
+        print_scan(table)
     readable = table[table["rate_hz"].notna()]
     if len(readable):
-        print_next(next_command(list(readable["file"]), options), apart=True)
+        complete = add_channels(options, examined.inspected)
+        print_next(next_command(list(readable["file"]), complete), apart=True)
         _print_suggestions(readable, examined.white_noise)
     for inspection in examined.inspected:
-        print_inspection(inspection)
+        print_inspection(inspection, [str(error) for error in examined.errors])
         if inspection.row is not None:
-            print_next(next_command(inspection.paths, inspection.options))
-    if options and examined.errors:
+            complete = add_channels(inspection.options, examined.inspected)
+            print_next(next_command(inspection.paths, complete))
+    if examined.errors and (options or len(lost) == len(table)):
         raise examined.errors[0]
     if len(lost):
         raise FormatError(

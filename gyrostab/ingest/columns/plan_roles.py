@@ -317,23 +317,36 @@ def _plan_channel(
 def _describe_lack(path: Path, columns: Sequence[FileColumn]) -> str:
     """Say that no column is a gyro axis, and how to name the likely ones."""
     headers = [column for column in distinct_columns(columns) if column.header]
-    free = [c for c in headers if not TIME_PATTERN.match(c.low) and quantity_of(c.low) is None]
+    free = [c for c in headers if not TIME_PATTERN.match(c.low) and _may_be_axis(c)]
     candidates = (c for pattern in GYRO_PATTERNS for c in free if pattern.search(c.name))
     likely = next(candidates, free[0] if free else None)
-    low = likely.header.lower() if likely else ""
-    unit = (
-        "deg/h" if re.search(r"deg_?(per_?|/)?h|dph", low) else "rad/s" if "rad" in low else "deg/s"
-    )
-    options = f" --unit gyro={unit}"
-    if likely and likely.unit and is_unit_of(likely.unit, ("rate",)):
-        options = ""
-    elif likely and likely.unit and is_unit_of(likely.unit, ("angle",)):
-        options = f" --kind {'rate' if INCREMENT_PATTERN.search(likely.name) else 'angle'}"
+    advice = f"If it holds channels of another log, give it as --channel {shlex.quote(path.name)}"
+    if likely is not None:
+        example = f'--map "{likely.key}=gyro_x"{_axis_options(likely)}'
+        advice = f"Say which they are, for instance: {example}"
     return (
         "no gyro column (gyro_x, gyro_y, gyro_z or angle_x ...). Columns: "
-        f"{list_some([c.name for c in headers], 100)}. Say which they are, for instance: --map "
-        f'"{likely.key if likely else "NAME"}=gyro_x"{options}{scan_advice(path)}'
+        f"{list_some([c.name for c in headers], 100)}. {advice}{scan_advice(path)}"
     )
+
+
+def _axis_options(column: Header) -> str:
+    """Return the options that a column needs as a gyro axis, with a blank in front."""
+    if column.unit and is_unit_of(column.unit, ("rate",)):
+        return ""
+    if column.unit and is_unit_of(column.unit, ("angle",)):
+        return f" --kind {'rate' if INCREMENT_PATTERN.search(column.name) else 'angle'}"
+    low = column.header.lower()
+    if re.search(r"deg_?(per_?|/)?h|dph", low):
+        return " --unit gyro=deg/h"
+    return f" --unit gyro={'rad/s' if 'rad' in low else 'deg/s'}"
+
+
+def _may_be_axis(column: Header) -> bool:
+    """Return whether name, unit and values of a column allow a gyro axis."""
+    unit = column.unit or column.stored or "1"
+    has_other_unit = is_unit(unit) and not is_unit_of(unit, ("rate", "angle", "number"))
+    return not (has_other_unit or column.file.stamped or quantity_of(column.low))
 
 
 def scan_advice(path: Path) -> str:

@@ -331,7 +331,7 @@ def test_keys_of_columns_are_unique() -> None:
             "time [s],temperature [degC]\n0,1\n1,2\n",
             {},
             FormatError,
-            r'no gyro column.*--map "NAME=gyro_x"',
+            r"no gyro column.*give it as --channel log\.csv",
         ),
         (b"", {}, FormatError, r"log.csv: the file is empty"),
         (b"\n\n  \n", {}, FormatError, r"empty"),
