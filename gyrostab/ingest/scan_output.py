@@ -59,7 +59,7 @@ def print_scan(table: pd.DataFrame) -> None:
             plain[name] = [
                 None if pd.isna(stamp) else f"{format_stamp(stamp.value)}Z" for stamp in table[name]
             ]
-        plain["missing_share"] = table["missing_share"].round(6)
+        plain["missing_share"] = table["missing_share"].astype(float).round(6)
         counts = {"rows": "Int64", "gaps": "Int64"}
         plain.astype(counts).to_csv(sys.stdout, sep="\t", index=False)
         return
