@@ -5,15 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import dask.array as da
 import numpy as np
 import xarray as xr
 
-from gyrostab.errors import OptionError
-from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS
+from gyrostab.errors import MissingUnitError, OptionError, UnitError
+from gyrostab.ingest.columns.headers import (
+    KNOWN_CHANNEL_PATTERN,
+    example_unit,
+    quantity_of,
+    unit_quantity,
+)
+from gyrostab.schema import RESERVED_NAMES, SIGNAL_LONG_NAMES, SIGNAL_UNITS
 from gyrostab.store.write import declare_counts
 from gyrostab.time.grid import check_rate, check_span, time_coordinate
 from gyrostab.time.stamps import stamp_ns
-from gyrostab.units import INNER, parse_unit
+from gyrostab.units import HOUR, INNER, known_units, parse_unit
 
 
 def make_log(
@@ -31,8 +38,8 @@ def make_log(
     Parameters
     ----------
     values : array_like, shape (time,) or (axis, time)
-        Rotation rate or cumulative angle; NaN marks a missing sample. numpy or dask, float or
-        integer.
+        Rotation rate or cumulative angle; NaN marks a missing sample, and infinite values become
+        NaN. numpy or dask, float or integer; of labelled objects, the values only.
     rate : float
         Sampling rate [Hz].
     unit : str
@@ -54,9 +61,9 @@ def make_log(
     Raises
     ------
     OptionError
-        When shape, rate, start or kind is invalid.
-    UnitError
-        When the unit is unknown or does not fit `kind`.
+        When values, rate, start, kind or the name of a channel are invalid.
+    MissingUnitError, UnitError
+        When a unit is missing or unknown, or does not fit `kind` or a channel.
 
     Examples
     --------
@@ -70,10 +77,10 @@ def make_log(
     parsed = parse_unit(unit)
     if parsed.quantity != kind:
         raise OptionError(f"unit {unit!r} is a unit of {parsed.quantity}, but kind is {kind!r}")
-    data = values if hasattr(values, "ndim") else np.asarray(values)
+    data = _real_numbers(values, "the values")
     packing = declare_counts(data.dtype, parsed.factor) if data.dtype.kind in "iu" else {}
     data = data[None, :] if data.ndim == 1 else data
-    names = list(axis) if axis is not None else list("xyz")[: data.shape[0]]
+    names = list(axis) if axis is not None else list("xyz")[: len(data) if data.ndim else 0]
     if data.ndim != 2 or len(names) != data.shape[0]:
         raise OptionError(
             f"values of shape {data.shape} do not fit the axes {names}; give values as (axis, "
@@ -92,8 +99,61 @@ def make_log(
         coords=coordinates,
         attrs={"sampling_rate_hz": float(rate), "kind": kind},
     ).assign_coords(axis=names)
-    for name, (channel, text) in (channels or {}).items():
-        unit_of = parse_unit(text)
-        converted = np.asarray(channel) * unit_of.factor + unit_of.offset
-        log[name] = (("time",), converted, {"units": INNER[unit_of.quantity]})
+    for name, channel in (channels or {}).items():
+        log[name] = _channel_variable(name, channel, data.shape[1])
     return log
+
+
+def _real_numbers(values: Any, what: str) -> Any:
+    """Return an array, in dask if it is, with NaN in the place of infinite values."""
+    try:
+        data = values if isinstance(values, da.Array) else np.asarray(values)
+    except ValueError as error:  # rows of different lengths
+        raise OptionError(f"{what} are not an array: {error}") from error
+    if data.dtype.kind not in "biuf":
+        raise OptionError(
+            f"{what} are of type {data.dtype}; give real numbers, and NaN where one is missing"
+        )
+    if data.dtype.kind != "f":
+        return data
+    if isinstance(data, da.Array):
+        return data.map_blocks(_hide_infinite, dtype=data.dtype)
+    return _hide_infinite(data)
+
+
+def _hide_infinite(values: Any) -> Any:
+    infinite = np.isinf(values)
+    return np.where(infinite, values.dtype.type(np.nan), values) if infinite.any() else values
+
+
+def _channel_variable(name: str, channel: Any, size: int) -> xr.Variable:
+    """Return a channel in its inner unit, by the rules for files."""
+    if name in RESERVED_NAMES:
+        raise OptionError(
+            f"channel {name!r}: variables of gyrostab have this name; choose another one"
+        )
+    quantity = quantity_of(name)
+    example = example_unit(quantity)
+    if not (isinstance(channel, tuple | list) and len(channel) == 2 and isinstance(channel[1], str)):
+        raise MissingUnitError(
+            f"channel {name!r} carries no unit; give values and unit: "
+            f"channels={{{name!r}: (values, {example!r})}}"
+        )
+    values, text = _real_numbers(channel[0], f"the values of channel {name!r}"), channel[1]
+    if values.shape != (size,):
+        raise OptionError(
+            f"channel {name!r} has values of shape {values.shape}, and the log {size} samples; "
+            "give one value per sample, NaN where it is missing"
+        )
+    expected = None if quantity is None else unit_quantity(quantity)
+    unit = parse_unit(text, expected)
+    if expected not in (None, unit.quantity):
+        if KNOWN_CHANNEL_PATTERN.match(name) and expected != "number":  # a ramp has any unit
+            raise UnitError(
+                f"channel {name!r}: {text!r} is a unit of {unit.quantity}, not of {expected}; "
+                f"known are {known_units(expected)}"
+            )
+        quantity = None
+    scale = 1.0 / HOUR if quantity == "rotation_rate" else 1.0
+    converted = np.asarray(values) * (unit.factor * scale) + unit.offset
+    return xr.Variable("time", converted, {"units": INNER[quantity or unit.quantity]})

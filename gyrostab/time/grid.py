@@ -46,9 +46,10 @@ def check_rate(rate: float, name: str) -> None:
     Traceback (most recent call last):
     gyrostab.errors.OptionError: --rate 0: give the sampling rate in Hz, a number from 1e-09 to ...
     """
-    if not MIN_RATE_HZ <= rate <= MAX_RATE_HZ:  # false for nan too
+    is_number = isinstance(rate, int | float | np.number) and not isinstance(rate, bool)
+    if not (is_number and MIN_RATE_HZ <= rate <= MAX_RATE_HZ):  # false for nan too
         raise OptionError(
-            f"{name} {rate:g}: give the sampling rate in Hz, "
+            f"{name} {f'{rate:g}' if is_number else repr(rate)}: give the sampling rate in Hz, "
             f"a number from {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g}"
         )
 

@@ -1,0 +1,79 @@
+"""Logs of arrays in memory: what is accepted, and what is refused with advice."""
+
+from __future__ import annotations
+
+import dask.array as da
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+from gyrostab.errors import MissingUnitError, OptionError, UnitError
+from gyrostab.ingest.make_log import make_log
+
+VALUES = np.random.default_rng(1).standard_normal(50)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        VALUES.tolist(),
+        pd.Series(VALUES),
+        xr.DataArray(VALUES, dims="time"),
+        xr.DataArray(da.from_array(VALUES)),
+        da.from_array(VALUES, chunks=20),
+        pd.DataFrame(VALUES[None]),
+    ],
+)
+def test_anything_like_an_array_is_accepted(given):
+    log = make_log(given, rate=10.0, unit="deg/h")
+    assert log.chunks == ({"axis": (1,), "time": (20, 20, 10)} if isinstance(given, da.Array) else {})
+    np.testing.assert_array_equal(log.rate.values[0], VALUES)
+
+
+@pytest.mark.parametrize("to_array", [np.asarray, da.from_array])
+def test_infinite_values_are_missing(to_array):
+    spoilt = VALUES.astype(np.float32)
+    spoilt[[3, 7, 9]] = np.inf, -np.inf, np.nan
+    channels = {"temperature": (spoilt, "degC")}
+    log = make_log(to_array(spoilt), rate=10.0, unit="deg/h", channels=channels)
+    assert log.rate.dtype == np.float32
+    for name in ("rate", "temperature"):
+        assert np.flatnonzero(np.isnan(np.ravel(log[name].values))).tolist() == [3, 7, 9]
+        assert not np.isinf(log[name].values).any()
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"values": VALUES + 1j}, OptionError, "of type complex128; give real numbers"),
+        ({"values": ["a", "b"]}, OptionError, "give real numbers"),
+        ({"values": [[1.0, 2.0], [3.0]]}, OptionError, "not an array"),
+        ({"values": 5.0}, OptionError, r"shape \(\)"),
+        ({"values": VALUES[:, None]}, OptionError, r"shape \(50, 1\) do not fit"),
+        ({"rate": "10Hz"}, OptionError, "rate '10Hz': give the sampling rate in Hz, a number"),
+        ({"rate": None}, OptionError, "rate None: give"),
+        ({"channels": {"rate": (VALUES, "deg/h")}}, OptionError, "'rate': variables of gyrostab"),
+        ({"channels": {"time": (VALUES, "1")}}, OptionError, "'time': variables of gyrostab"),
+        ({"channels": {"temperature": (VALUES, "V")}}, UnitError, "unit of voltage, not of temp"),
+        ({"channels": {"accel_x": (VALUES[1:], "g")}}, OptionError, r"shape \(49,\).* 50 samples"),
+        ({"channels": {"vibration": VALUES}}, MissingUnitError, r"\{'vibration': \(values, 'g'\)\}"),
+        ({"channels": {"pump": (["on"] * 50, "1")}}, OptionError, "of channel 'pump' are of type"),
+    ],
+)
+def test_bad_input_is_refused_with_advice(change, error, message):
+    options = {"values": VALUES, "rate": 10.0, "unit": "deg/h", **change}
+    with pytest.raises(error, match=message):
+        make_log(options.pop("values"), **options)
+
+
+def test_channels_have_the_units_of_channels_of_files():
+    given = {"rotation_rate": "rpm", "toolface": "rad", "temperature_case": "V", "ramp": "V"}
+    channels = {name: (np.ones(50), unit) for name, unit in given.items()}
+    log = make_log(VALUES, rate=10.0, unit="deg/h", channels=channels)
+    assert {name: (float(log[name][0]), log[name].units) for name in given} == {
+        "rotation_rate": (6.0, "degree s-1"),
+        "toolface": (pytest.approx(57.29578), "degree"),
+        "temperature_case": (1.0, "V"),
+        "ramp": (1.0, "V"),
+    }
