@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,11 +11,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.errors import OptionError, SchemaError, TimeError
+from gyrostab.errors import MissingUnitError, OptionError, SchemaError, TimeError, UnitError
 from gyrostab.kernels.regression.trend import window_trend
 from gyrostab.schema import is_rate_of_change
 from gyrostab.time.stamps import to_nanoseconds
-from gyrostab.units import HOUR, INNER
+from gyrostab.units import HOUR, INNER, parse_unit
 
 Array = NDArray[np.float64]
 
@@ -24,6 +25,8 @@ MAX_GAP_SPACINGS = 3.0
 # Names in the denominator of a sensitivity: a difference of temperatures is in kelvin, and UDUNITS
 # takes "g" for the gram.
 _DIFFERENCE_UNITS = {"degree_Celsius": "K", "g": "standard_free_fall"}
+#: A name with its power in a unit: "m", "/s2", "s^-1".
+_POWER = re.compile(r"(/?)\s*([^\s\d/*^.()+-]+)(?:\^|\*\*)?([+-]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -95,11 +98,14 @@ def _align_channel(
                 if available
                 else "the product has no channels; give a file with --channel"
             )
-        name, units = channel, str(product[channel].attrs.get("units", "1"))
+        name = channel
+        factor, offset, units = _convert_units(product[channel], f"product[{channel!r}]")
         mean, rate = _align_product_channel(product, channel, lags, step)
     else:
-        name, units = _name_channel(channel, product), str(channel.attrs.get("units", "1"))
+        name = _name_channel(channel, product)
+        factor, offset, units = _convert_units(channel, "channel")
         mean, rate = _align_file_channel(channel, product, lags, step)
+    mean, rate = mean * factor + offset, rate * factor
     label = name.replace("_", " ")
     return [
         Driver(name, label, units, mean, is_rate_of_change(name, product)),
@@ -111,6 +117,26 @@ def _align_channel(
             derived=True,
         ),
     ]
+
+
+def _convert_units(channel: xr.DataArray, what: str) -> tuple[float, float, str]:
+    """Return factor and offset to the inner unit of a channel, and that unit.
+
+    A unit that is not known, such as m/s, is kept.
+    """
+    text = channel.attrs.get("units")
+    if text is None:
+        raise MissingUnitError(
+            f"channel {str(channel.name)!r} has no units; set them, for instance "
+            f"{what}.attrs['units'] = 'degC' ('1' for a number without a unit)"
+        )
+    try:
+        unit = parse_unit(str(text))
+    except UnitError:
+        return 1.0, 0.0, _multiply_units(str(text), {})
+    if unit.quantity == "rate":  # the rate of a tool, not that of a gyro
+        return unit.factor / HOUR, 0.0, INNER["rotation_rate"]
+    return unit.factor, unit.offset, INNER[unit.quantity]
 
 
 def other_channels(product: xr.Dataset, drivers: Sequence[Driver]) -> list[str]:
@@ -260,7 +286,7 @@ def _check_channel(channel: xr.DataArray, product: xr.Dataset) -> tuple[Array, N
         raise TimeError(
             f"channel {channel.name!r} {extent}, the product {_stamp_text(bounds[0, 0])} to "
             f"{_stamp_text(bounds[-1, 1])}: they do not overlap; check the file, or the zero of "
-            "its time with --epoch"
+            "its time with epoch (--epoch)"
         )
     return values, stamps
 
@@ -270,11 +296,13 @@ def _stamp_text(stamp: Any) -> str:
 
 
 def _unit_powers(units: str) -> dict[str, int]:
+    """Return the powers of a unit: ``{"m": 1, "s": -1}`` for ``"m/s"``."""
+    text = units.replace("·", " ").replace(" per ", "/")
+    if _POWER.sub("", text).strip(" *.()") not in ("", "1"):
+        raise UnitError(f"unit {units!r}: write it as a product of powers, for instance 'm s-1'")
     powers: dict[str, int] = {}
-    for word in units.split():
-        bare = word.rstrip("-0123456789") or word
-        powers[bare] = powers.get(bare, 0) + int(word[len(bare) :] or 1)
-    powers.pop("1", None)
+    for slash, name, power in _POWER.findall(text):
+        powers[name] = powers.get(name, 0) + int(power or 1) * (-1 if slash else 1)
     return powers
 
 

@@ -17,7 +17,7 @@ from gyrostab.cli import main
 from gyrostab.correlate.dataset import join
 from gyrostab.correlate.judge import VERDICTS
 from gyrostab.correlate.table import format_correlation
-from gyrostab.errors import OptionError, TimeError
+from gyrostab.errors import MissingUnitError, OptionError, TimeError, UnitError
 from gyrostab.kernels.regression.coupling import (
     calibrated,
     decompose,
@@ -353,6 +353,47 @@ def probe_channel(values, product, every):
     return xr.DataArray(
         values, dims="t", coords={"t": stamps}, name="probe", attrs={"units": "degree_Celsius"}
     )
+
+
+@pytest.mark.parametrize(
+    ("units", "factor", "offset", "inner"),
+    [
+        ("degF", 1.8, 32.0, "K"),
+        ("K", 1.0, 273.15, "K"),
+        ("rpm", 1 / 6, 0.0, "degree s-1"),
+        ("m/s", 1.0, 0.0, "m s-1"),
+        ("m s^-1", 1.0, 0.0, "m s-1"),
+        ("m.s-1", 1.0, 0.0, "m s-1"),
+        ("metre per second", 1.0, 0.0, "m s-1"),
+    ],
+)
+def test_sensitivities_are_in_the_unit_of_the_channel(units, factor, offset, inner):
+    product = coupled.product(slope=0.3, noises="white", gap=False, terms=False)
+    course = 20 + 5 * np.sin(np.arange(363.0) / 30)
+    probe = probe_channel(course, product, 10.0)
+    options = {"variables": "window_mean", "max_lag": 0}
+    expected = gyrostab.correlate(product, channel=probe, **options)
+    given = (probe * factor + offset).assign_attrs(units=units)
+    found = gyrostab.correlate(product, channel=given, **options)
+    for name, over in (("probe", inner), ("probe_rate", f"{inner} hour-1")):
+        slope = found[f"window_mean_per_{name}"]
+        np.testing.assert_allclose(slope, expected[f"window_mean_per_{name}"])
+        meant = cf_units.Unit("degree hour-1") / cf_units.Unit(over)
+        assert cf_units.Unit(slope.units).convert(1.0, meant) == pytest.approx(1.0)
+    np.testing.assert_allclose(found["probe"], expected["probe"])
+
+
+@pytest.mark.parametrize(
+    ("attrs", "error"), [({}, MissingUnitError), ({"units": "0.5 m"}, UnitError)]
+)
+def test_channels_without_a_usable_unit_are_refused(attrs, error):
+    product = coupled.product(noises="white", gap=False, terms=False)
+    probe = probe_channel(np.arange(363.0), product, 10.0)
+    probe.attrs = attrs
+    product["flow"] = product["temperature"].drop_attrs().assign_attrs(attrs)
+    for channel in (probe, "flow"):
+        with pytest.raises(error, match=r"attrs\['units'\] = 'degC'|product of powers"):
+            gyrostab.correlate(product, channel=channel)
 
 
 def test_short_gaps_of_a_channel_are_interpolated_and_long_ones_are_not():
