@@ -83,9 +83,10 @@ def check_options(
     tau = surface["tau"].values
     chosen = np.flatnonzero((tau >= low * (1 - 1e-9)) & (tau <= high * (1 + 1e-9)))
     if chosen.size == 0:
+        limits = [f"from {low:g} s on"] * (low > 0) + [f"up to {high:g} s"] * (high < np.inf)
         raise OptionError(
-            f"no averaging time of the surface lies between {low:g} s and {high:g} s; it has "
-            f"{tau[0]:g} s to {tau[-1]:g} s; change --fit-from or --fit-to"
+            f"the surface has no averaging time {' and '.join(limits)}; it has {tau[0]:g} s to "
+            f"{tau[-1]:g} s; change tau_min (--fit-from) or tau_max (--fit-to)"
         )
     return fitted_terms, chosen
 

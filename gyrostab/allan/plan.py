@@ -120,7 +120,7 @@ def choose_window(log: xr.Dataset) -> str:
 
 
 def _select_axes(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArray:
-    axes = [axis] if isinstance(axis, str) else list(dict.fromkeys(axis))
+    axes = [axis] if isinstance(axis, str) or not np.iterable(axis) else list(dict.fromkeys(axis))
     available = [str(name) for name in signal["axis"].values]
     unknown = [name for name in axes if name not in available]
     if unknown or not axes:
@@ -134,7 +134,7 @@ def _check_size(available: int) -> None:
     if available < MIN_WINDOW_SAMPLES:
         raise OptionError(
             f"the record has {available} sample{'s' * (available > 1)}, and a window needs at "
-            f"least {MIN_WINDOW_SAMPLES}; no --window helps: give a longer log"
+            f"least {MIN_WINDOW_SAMPLES}; no window (--window) helps: give a longer log"
         )
 
 
@@ -144,7 +144,7 @@ def _window_and_step(window: Any, step: Any, rate: float, available: int) -> tup
     if length > available:
         raise OptionError(
             f"the window of {length / rate:g} s ({length} samples) is longer than the record of "
-            f"{available / rate:g} s; give a shorter --window"
+            f"{available / rate:g} s; give a shorter window (--window)"
         )
     if length < MIN_WINDOW_SAMPLES:
         raise OptionError(
@@ -155,7 +155,7 @@ def _window_and_step(window: Any, step: Any, rate: float, available: int) -> tup
     if hop > length:
         raise OptionError(
             f"the step of {hop / rate:g} s is longer than the window of {length / rate:g} s, so "
-            "samples would be left out; give a shorter --step"
+            "samples would be left out; give a shorter step (--step)"
         )
     return length, hop
 

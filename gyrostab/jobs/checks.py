@@ -66,7 +66,7 @@ def _check_windows(
     if window and step and ("sample" in window) == ("sample" in step) and step_length > length:
         raise OptionError(
             f"the step of {step} is longer than the window of {window}, "
-            "so samples would be left out; give a shorter --step"
+            "so samples would be left out; give a shorter step (--step)"
         )
     # the duration of a number of samples depends on the rate
     half = math.inf if window and "sample" in window else length / fine / 2
@@ -81,5 +81,5 @@ def _check_windows(
             raise OptionError(
                 f"tau {tau.strip()} is longer than half of the window of {window}, "
                 "so no second difference fits; "
-                "give a longer --window or a shorter tau"
+                "give a longer window (--window) or a shorter tau"
             )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import OptionError
 
 #: Examples of averaging times, for messages.
-TAUS = "--taus 40 (how many), octave, all or 0.1s,1s,10s"
+TAUS = "40 (how many), octave, all or 0.1s,1s,10s for taus (--taus)"
 #: Part of the window that the longest averaging time takes, by the order of the differences.
 _PARTS = {2: "half", 3: "a third"}
 _SAMPLE_COUNT = re.compile(r"^\s*(\d{1,18})\s*samples?\s*$", re.ASCII)
@@ -48,11 +48,11 @@ def duration_seconds(
                 raise ValueError("numbers without a unit between them")
             text = re.sub(r"(?<=[\d ])m$", "min", value.strip().replace("μ", "µ"))
             text = re.sub(r"(?<=[\d ])d(?![a-z])", "D", text)  # as pandas names a day
-            seconds = pd.Timedelta(text).value / 1e9
+            seconds = _timedelta_seconds(text)
         elif _is_bare_number(value):
             seconds = float(value)
         else:
-            seconds = pd.Timedelta(value).value / 1e9
+            seconds = _timedelta_seconds(value)
     except OptionError:
         raise
     except (ValueError, TypeError, OverflowError) as error:
@@ -62,6 +62,13 @@ def duration_seconds(
     if not (np.isfinite(seconds) and (seconds > 0 or (zero and seconds == 0))):
         raise OptionError(f"{option} {value!r} must be longer than zero")
     return float(seconds)
+
+
+def _timedelta_seconds(value: Any) -> float:
+    length = pd.Timedelta(value)
+    if pd.isna(length):
+        raise ValueError("no length")
+    return float(length.value / 1e9)
 
 
 def format_duration(seconds: float, space: str = "") -> str:
@@ -130,7 +137,14 @@ def _is_bare_number(value: Any) -> bool:
     """
     if isinstance(value, str):
         return bool(_NUMBER.match(value))
-    return isinstance(value, int | float | np.number) and not isinstance(value, np.timedelta64)
+    return isinstance(value, int | float | np.number) and not isinstance(
+        value, bool | np.timedelta64
+    )
+
+
+def _show_length(value: Any) -> str:
+    """Show a length in a message: a number is in seconds, anything else as it was written."""
+    return f"{value:g} s" if _is_bare_number(value) and not isinstance(value, str) else repr(value)
 
 
 def averaging_factors(
@@ -182,7 +196,7 @@ def averaging_factors(
             return np.arange(1, limit + 1, dtype=np.int64)
         is_count = _COUNT.match(text)
         taus = int(text) if is_count else [part for part in text.split(",") if part.strip()]
-    is_number = isinstance(taus, int | np.integer)
+    is_number = isinstance(taus, int | np.integer) and not isinstance(taus, bool)
     if (is_number and taus < 1) or not (is_number or np.iterable(taus)):
         raise OptionError(
             f"taus={taus}: give a number of averaging times above 0, 'octave', 'all' "
@@ -206,14 +220,14 @@ def _listed_factors(taus: Any, rate: float, longest: int, order: int) -> NDArray
         k = round(duration_seconds(tau, "tau", example=TAUS) * rate)
         if k < 1:
             raise OptionError(
-                f"tau {tau!r} is shorter than one sample at {rate:g} Hz; "
+                f"tau {_show_length(tau)} is shorter than one sample at {rate:g} Hz; "
                 f"give {1 / rate:g} s or more"
             )
         if k > longest:
             raise OptionError(
-                f"tau {tau!r} is longer than {_PARTS[order]} of the window ({longest / rate:g} s), "
-                f"so no {'second' if order == 2 else 'third'} difference fits; "
-                "give a longer --window or shorter --taus"
+                f"tau {_show_length(tau)} is longer than {_PARTS[order]} of the window "
+                f"({longest / rate:g} s), so no {'second' if order == 2 else 'third'} difference "
+                "fits; give a longer window (--window) or shorter taus (--taus)"
             )
         ks.append(k)
     return np.unique(np.asarray(ks, dtype=np.int64))

@@ -440,7 +440,7 @@ class TestLabels:
     @pytest.mark.parametrize(
         ("options", "words"),
         [
-            ({"window": "1h"}, "longer than the record"),
+            ({"window": "1h"}, "longer than the record .*; give a shorter window .--window"),
             ({"window": "10s", "step": "11s"}, "longer than the window"),
             ({"window": "10s", "taus": [6.0]}, "longer than half of the window"),
             ({"window": "10s", "taus": [0.001]}, "shorter than one sample"),
@@ -454,8 +454,10 @@ class TestLabels:
             ({"window": "soon"}, "not a duration"),
             ({"window": "-10s"}, "longer than zero"),
             ({"window": "10s", "taus": 0}, "above 0"),
-            ({"window": "10s", "taus": ["soon"]}, "--taus 40 .how many., octave, all or 0.1s"),
+            ({"window": "10s", "taus": ["soon"]}, "40 .how many., octave, all or 0.1s.*for taus"),
             ({"window": "10s", "axis": "q"}, "axis 'q' is not in the log; it has x"),
+            ({"window": "10s", "axis": 0}, "axis 0 is not in the log; it has x"),
+            ({"window": True}, "window True is not a duration"),
             ({"window": "10s", "min_strict": "0.3"}, "min_strict='0.3': give a share from 0 to 1"),
             ({"window": "10s", "min_strict": -0.1}, "min_strict=-0.1"),
             ({"window": "10s", "min_coverage": 5}, "min_coverage=5"),

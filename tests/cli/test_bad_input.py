@@ -153,7 +153,7 @@ BAD_INPUT = {
     },
     "two samples": (
         _bad_text(b"time [s],gyro_x [deg/h]\n0,1\n1,2\n"),
-        "record has 2 samples, .* at least 4; no --window helps: give a longer log",
+        "record has 2 samples, .* at least 4; no window .--window. helps: give a longer log",
     ),
     "axis that is not there": (_bad_log("--axis", "w", *WINDOW), "axis|'w'"),
     "more than half unreadable": (_bad_log(change=_words), "unreadable"),
@@ -251,7 +251,7 @@ def test_record_without_a_whole_window_gets_no_advice_on_the_window(tmp_path, ca
     assert call("run", path, "-o", tmp_path / "out.nc") == 2
     shown = capfd.readouterr().err
     assert "the record has 3 samples" in shown
-    assert "give a shorter --window" not in shown
+    assert "give a shorter window" not in shown
     assert "the window is" not in shown
 
 

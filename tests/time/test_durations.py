@@ -53,10 +53,23 @@ def test_tau_max_limits_a_list():
         averaging_factors("3s,4s", rate=100.0, window=1000, tau_max="2s")
 
 
-@pytest.mark.parametrize("taus", [40.0, None, np.array(0.5)])
+@pytest.mark.parametrize("taus", [40.0, None, np.array(0.5), True])
 def test_averaging_times_of_another_type_are_refused_clearly(taus):
     with pytest.raises(OptionError, match="give a number of averaging times above 0"):
         averaging_factors(taus, rate=100.0, window=1000)
+
+
+@pytest.mark.parametrize("value", [True, "nan", "NaT", np.timedelta64("NaT"), [1.0]])
+def test_what_is_no_length_is_refused_clearly(value):
+    for read in (lambda: samples(value, 100.0, "step"), lambda: duration_seconds(value, "step")):
+        with pytest.raises(OptionError, match=r"step .* is not a duration; write for instance"):
+            read()
+
+
+@pytest.mark.parametrize("taus", [[0.1, 40], np.array([0.1, 40.0]), ["0.1s", "40s"]])
+def test_messages_on_averaging_times_have_their_unit(taus):
+    with pytest.raises(OptionError, match=r"tau ('40s'|40 s) is longer .*window \(--window\)"):
+        averaging_factors(taus, rate=10.0, window=100)
 
 
 @pytest.mark.parametrize("text", ["1,5min", "1, 5 min", "1 5min", "1.5.3s", "1 00:00:05"])
