@@ -11,6 +11,7 @@ every product variable; the stages and the export all read it.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Hashable
 from typing import Any
 
@@ -188,6 +189,9 @@ def signal_name(log: xr.Dataset) -> str:
         When it holds neither, or both.
     """
     signals = [name for name in SIGNAL_UNITS if name in log.data_vars]
+    if "avar" in log.data_vars:
+        kind = "product" if "observable" in log.data_vars else "DAVAR surface"
+        raise SchemaError(f"this is a {kind}, not a log; give the log from which it was computed")
     if len(signals) != 1:
         holds = ", ".join(signals or sorted(map(str, log.data_vars))) or "nothing"
         raise SchemaError(
@@ -225,13 +229,23 @@ def is_rate_of_change(name: str, product: xr.Dataset) -> bool:
     return name.endswith("_rate") and name.removesuffix("_rate") in product.data_vars
 
 
-def _require_variables(dataset: xr.Dataset, kind: str, dims: dict[str, tuple[str, ...]]) -> None:
+def require_dataset(dataset: Any, kind: str) -> None:
+    """Raise `SchemaError` unless this is a dataset, and not the name of its file."""
+    if isinstance(dataset, str | os.PathLike):
+        raise SchemaError(
+            f"{os.fspath(dataset)!r} is the name of a file, not a {kind}: open it with "
+            f"{_OPENERS[kind]}"
+        )
     if not isinstance(dataset, xr.Dataset):
         raise SchemaError(
             f"this is a {type(dataset).__name__}, not a {kind}: give the whole xarray.Dataset; "
             f"{_MAKERS[kind]} makes one, and gyrostab.from_dataframe and gyrostab.from_dataarray "
             "make logs"
         )
+
+
+def _require_variables(dataset: xr.Dataset, kind: str, dims: dict[str, tuple[str, ...]]) -> None:
+    require_dataset(dataset, kind)
     for name, expected in dims.items():
         if name not in dataset.variables:
             raise SchemaError(
@@ -268,6 +282,17 @@ _MAKERS = {
     "log": "gyrostab.make_log",
     "DAVAR surface": "gyrostab.davar",
     "product": "gyrostab.fit_noise",
+}
+
+#: What a message calls a dataset -> the function that opens its file.
+_OPENERS = {
+    "raw log": "gyrostab.read_log",
+    "log": (
+        "gyrostab.open_log, or a file of another program with "
+        "gyrostab.regularise(gyrostab.read_log(...))"
+    ),
+    "DAVAR surface": "gyrostab.open_surface",
+    "product": "gyrostab.open_product",
 }
 
 
@@ -311,11 +336,24 @@ def check_log(log: xr.Dataset, *, rate: bool = True) -> None:
 
 def _check_units(dataset: xr.Dataset, name: str) -> None:
     units = dataset.variables[name].attrs.get("units")
+    if units is None:
+        raise SchemaError(
+            f"variable {name!r} has no units; set them, {SIGNAL_UNITS[name]!r} if they were not "
+            f"changed: dataset[{name!r}].attrs['units'] = {SIGNAL_UNITS[name]!r}"
+        )
     if units != SIGNAL_UNITS[name]:
         raise SchemaError(
             f"variable {name!r} has units {units!r}, expected {SIGNAL_UNITS[name]!r}; "
             f"gyrostab.from_dataarray(dataset[{name!r}]) converts it"
         )
+
+
+def with_axis(product: xr.Dataset) -> xr.Dataset:
+    """Return a surface or product with its dimension ``axis``, also after ``.sel(axis="x")``."""
+    if not isinstance(product, xr.Dataset) or "axis" not in product or product["axis"].ndim:
+        return product
+    names = [name for name in VARIABLES if name in product.data_vars]
+    return product.assign({name: product[name].expand_dims("axis") for name in names})
 
 
 def check_surface(surface: xr.Dataset) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.errors import SchemaError
+from gyrostab.errors import OptionError, SchemaError
 from gyrostab.schema import check_product
 from tests.support import synthetic
 
@@ -81,6 +83,52 @@ def test_figures_refuse_products_without_what_they_draw(
 ) -> None:
     with pytest.raises(SchemaError, match=words):
         draw(change(product))
+
+
+@pytest.mark.parametrize(
+    "draw", [gyrostab.plot_coefficients, gyrostab.plot_davar, gyrostab.plot_adev]
+)
+def test_figures_of_a_selected_axis(product: xr.Dataset, draw: Callable[..., Any]) -> None:
+    single, whole = draw(product.sel(axis="y")), draw(product, axis="y")
+    for own, expected in zip(single.axes, whole.axes, strict=True):
+        assert own.get_ylabel() == expected.get_ylabel()
+        assert own.dataLim.bounds == expected.dataLim.bounds
+
+
+def test_the_interval_of_a_selected_axis(product: xr.Dataset) -> None:
+    interval = gyrostab.confidence_interval(product.sel(axis="y"))
+    xr.testing.assert_equal(interval, gyrostab.confidence_interval(product).sel(axis=["y"]))
+
+
+def test_an_allan_deviation_of_several_axes_needs_one(product: xr.Dataset) -> None:
+    with pytest.raises(OptionError, match="axis='x'; there are x, y, z"):
+        gyrostab.plot_adev(product)
+
+
+@pytest.mark.parametrize(
+    ("function", "opener"),
+    [
+        (gyrostab.davar, "gyrostab.open_log, or a file of another program with"),
+        (gyrostab.regularise, "gyrostab.read_log"),
+        (gyrostab.fit_noise, "gyrostab.open_surface"),
+        (gyrostab.correlate, "gyrostab.open_surface"),
+        (gyrostab.plot_coefficients, "gyrostab.open_product"),
+    ],
+)
+def test_the_name_of_a_file_is_no_dataset(function: Callable[[Any], Any], opener: str) -> None:
+    for name in ("run.nc", Path("run.nc")):
+        with pytest.raises(SchemaError, match=f"'run.nc' is the name of a file.*{opener}"):
+            function(name)
+
+
+def test_other_datasets_are_no_log(product: xr.Dataset) -> None:
+    for function in (gyrostab.davar, gyrostab.plot_signal, gyrostab.gap_table):
+        with pytest.raises(SchemaError, match="this is a product, not a log; give the log from"):
+            function(product)
+    log = synthetic.log()
+    del log.rate.attrs["units"]
+    with pytest.raises(SchemaError, match=r"dataset\['rate'\]\.attrs\['units'\] = 'degree hour-1'"):
+        gyrostab.davar(log)
 
 
 @pytest.mark.parametrize(

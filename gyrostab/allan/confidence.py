@@ -9,7 +9,7 @@ import xarray as xr
 
 from gyrostab.allan.variance import variance_name
 from gyrostab.errors import OptionError
-from gyrostab.schema import check_surface
+from gyrostab.schema import check_surface, with_axis
 
 
 def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Dataset:
@@ -53,6 +53,7 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
     >>> bool((limits.avar_lower < 0.01) & (0.01 < limits.avar_upper))
     True
     """
+    surface = with_axis(surface)
     check_surface(surface)
     if not 0.0 < level < 1.0:
         raise OptionError(f"level={level!r}: give a probability between 0 and 1, such as 0.95")

@@ -27,7 +27,7 @@ from gyrostab.plot.style import (
     unit_symbol,
     write_in_middle,
 )
-from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY, check_surface
+from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY, check_surface, with_axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,7 +40,7 @@ _DASHES = ("--", "-.", ":", (0, (6, 2, 1, 2, 1, 2)), (0, (8, 3)))
 
 @draws_figure
 def plot_adev(
-    product: xr.Dataset, axis: str, *, when: Any = None, width: float = PAGE_MM
+    product: xr.Dataset, axis: str | None = None, *, when: Any = None, width: float = PAGE_MM
 ) -> Figure:
     """Draw the Allan deviation of one window, with its 95 % band and the fitted noise terms.
 
@@ -48,8 +48,8 @@ def plot_adev(
     ----------
     product : xarray.Dataset
         Surface or product, ``avar`` [degree2 hour-2] and ``edf`` with dims ``(axis, time, tau)``.
-    axis : str
-        Axis to draw.
+    axis : str, optional
+        Axis to draw; not needed if there is only one.
     when : datetime-like, optional
         Time of the window (the nearest window centre); by default, of the windows with the best
         coverage, the one nearest to the middle of the record.
@@ -65,10 +65,14 @@ def plot_adev(
     SchemaError, OptionError
         If `product` is not a surface or has no such axis, or `when` is outside the record.
     """
+    product = with_axis(product)
     check_surface(product)
     if "observable" in product:
         require_coefficients(product)
-    (name,) = axis_names(product, axis)
+    names = axis_names(product, axis)
+    if len(names) > 1:
+        raise OptionError(f"give the axis to draw: axis={names[0]!r}; there are {', '.join(names)}")
+    name = names[0]
     windows = (
         product.sel(axis=[name]).isel(time=[_select_window(product.sel(axis=name), when)]).compute()
     )

@@ -30,7 +30,7 @@ from gyrostab.plot.style import (
     write_in_middle,
 )
 from gyrostab.plot.surface import find_time_edges
-from gyrostab.schema import NOT_OBSERVABLE, OBSERVED, UPPER_LIMIT_ONLY
+from gyrostab.schema import NOT_OBSERVABLE, OBSERVED, UPPER_LIMIT_ONLY, with_axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -64,6 +64,7 @@ def plot_coefficients(
     SchemaError, OptionError
         If `product` has no coefficients or no such axis.
     """
+    product = with_axis(product)
     require_coefficients(product)
     names = axis_names(product, axis)
     figure = new_figure(width / INCH_MM, 7.6)

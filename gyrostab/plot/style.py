@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.schema import check_coefficients
+from gyrostab.schema import check_coefficients, require_dataset
 from gyrostab.time.durations import format_duration
 from gyrostab.units import DAY, HOUR, INNER
 
@@ -327,11 +327,7 @@ def shade_spans(
 
 def require_coefficients(product: xr.Dataset) -> None:
     """Raise `SchemaError` if the dataset has no coefficients."""
-    if not isinstance(product, xr.Dataset):
-        raise SchemaError(
-            f"this is a {type(product).__name__}, not a product: give what gyrostab.fit_noise "
-            "returns"
-        )
+    require_dataset(product, "product")
     if "observable" not in product.variables:
         raise SchemaError(
             "this surface holds no coefficients yet; call gyrostab.fit_noise (or 'gyrostab fit') "

@@ -24,7 +24,7 @@ from gyrostab.plot.style import (
     unit_of_time,
     window_text,
 )
-from gyrostab.schema import ESTIMATORS, check_surface
+from gyrostab.schema import ESTIMATORS, check_surface, with_axis
 from gyrostab.time.stamps import to_nanoseconds
 
 if TYPE_CHECKING:
@@ -73,6 +73,7 @@ def plot_davar(
     SchemaError, OptionError
         If `product` is not a surface or has no such axis.
     """
+    product = with_axis(product)
     check_surface(product)
     from matplotlib.colors import LogNorm
     from matplotlib.patches import Patch
@@ -176,6 +177,7 @@ def plot_davar_3d(
     SchemaError, OptionError
         If `product` is not a surface or has no such axis.
     """
+    product = with_axis(product)
     check_surface(product)
     from matplotlib.ticker import FuncFormatter, MaxNLocator
 

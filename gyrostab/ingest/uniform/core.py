@@ -25,7 +25,7 @@ from gyrostab.ingest.gap_table import (
     sort_gaps,
 )
 from gyrostab.ingest.uniform.grid import UniformGrid, find_grid
-from gyrostab.schema import check_log, signal_name, texts
+from gyrostab.schema import check_log, require_dataset, signal_name, texts
 from gyrostab.store.private import close_function
 from gyrostab.time.grid import TimeGridIndex, grid_index, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
@@ -126,11 +126,7 @@ def advise_dates(times: NDArray[Any], name: str) -> str:
 
 def _with_dimensions(log: Any) -> xr.Dataset:
     """Return the log with its signal on ``(axis, time)``, from another order or a single axis."""
-    if not isinstance(log, xr.Dataset):
-        raise SchemaError(
-            f"this is a {type(log).__name__}, not a log (an xarray.Dataset); make one with "
-            "gyrostab.make_log"
-        )
+    require_dataset(log, "log")
     if "row" in log.dims:
         raise SchemaError(
             "these are raw rows with their stamps as written; call gyrostab.regularise(raw) first"
