@@ -7,13 +7,13 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.errors import SchemaError
 from gyrostab.ingest.gap_table import MISSING, OUTSIDE_RANGE, UNREADABLE, sort_lines
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, find_spans
-from gyrostab.ingest.uniform.core import merge_spans
+from gyrostab.ingest.uniform.core import add_spans, as_uniform, merge_spans, with_table
 from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART, STEP
-from gyrostab.schema import GAP_CAUSES
+from gyrostab.schema import GAP_CAUSES, signal_name
+from gyrostab.time.grid import first_stamp
 
 
 def _missing_samples(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
@@ -99,14 +99,25 @@ def find_gaps(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
     return sort_lines(table)
 
 
+def _missing_spans(log: xr.Dataset) -> NDArray[np.int64]:
+    """List the spans of samples that are NaN on any axis, read block by block."""
+    signal = log[signal_name(log)]
+    spans = []
+    for begin in range(0, signal.sizes["time"], BLOCK_ROWS):
+        block = signal.isel(time=slice(begin, begin + BLOCK_ROWS))
+        spans.append(find_spans(block.isnull().any("axis").values, begin))
+    return add_spans(np.empty((0, 5), dtype=np.int64), merge_spans(spans), MISSING)
+
+
 def gap_table(log: xr.Dataset) -> pd.DataFrame:
     """List the gaps of a regular log.
 
     Parameters
     ----------
     log : xarray.Dataset
-        Log of `regularise`, with the variables ``gap_start``, ``gap_end``, ``gap_samples``,
-        ``gap_rows``, ``gap_cause`` on ``gap``.
+        Regular log, with a table of gaps (``gap_start``, ``gap_end``, ``gap_samples``,
+        ``gap_rows``, ``gap_cause`` on ``gap``) as from `regularise`, or without one: then the
+        samples that are NaN on any axis are listed, with cause "missing".
 
     Returns
     -------
@@ -116,7 +127,7 @@ def gap_table(log: xr.Dataset) -> pd.DataFrame:
     Raises
     ------
     SchemaError
-        When the log has no table of gaps.
+        When it is not a regular log.
 
     Examples
     --------
@@ -128,11 +139,10 @@ def gap_table(log: xr.Dataset) -> pd.DataFrame:
        seconds  samples  rows    cause
     0     0.02        2     0  missing
     """
-    if not isinstance(log, xr.Dataset) or "gap_start" not in log.variables:
-        raise SchemaError(
-            "this log has no table of gaps (gap_start, gap_end, ...); gyrostab.regularise makes "
-            "logs with one"
-        )
+    log = as_uniform(log)
+    if "gap_start" not in log.variables:
+        rate = float(log.attrs["sampling_rate_hz"])
+        log = with_table(log, _missing_spans(log), first_stamp(log), rate)
     start, end = log["gap_start"].values, log["gap_end"].values
     cause = np.array(GAP_CAUSES, dtype=object)[log["gap_cause"].values.astype(int)]
     samples = log["gap_samples"].values
