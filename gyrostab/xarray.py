@@ -79,6 +79,7 @@ class GyroAccessor:
     def __repr__(self) -> str:
         kind = "surface" if self._holds_variable("avar") else "log"
         kind = "product" if self._holds_variable("observable") else kind
+        kind = "coefficient" if "unit_label" in self._data.attrs else kind
         sizes = ", ".join(f"{dim} {size}" for dim, size in self._data.sizes.items())
         return f"<gyrostab {kind}: {sizes}>"
 

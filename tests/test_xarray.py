@@ -190,6 +190,9 @@ def test_other_files_are_refused(tmp_path):
     xr.Dataset({"a": ("x", [1.0])}).to_netcdf(tmp_path / "other.nc")
     with pytest.raises(FormatError, match=r"other\.nc: holds no log, surface or product"):
         xr.open_dataset(tmp_path / "other.nc", engine="gyrostab")
+    (tmp_path / "log.csv").write_text("time [s],gyro_x [deg/h]\n0,1\n1,2\n", encoding="utf-8")
+    with pytest.raises(FormatError, match=r"log\.csv: is a text file; gyrostab\.read_log reads"):
+        xr.open_dataset(tmp_path / "log.csv", engine="gyrostab")
     with pytest.raises(FormatError, match="there is no such file"):
         xr.open_dataset(tmp_path / "nothing.nc", engine="gyrostab")
     (tmp_path / "fleet.zarr").mkdir()
@@ -240,6 +243,10 @@ def test_the_accessor_draws_what_it_is_given():
 def test_the_accessor_explains_what_it_cannot_do():
     with pytest.raises(SchemaError, match="holds either 'rate' or 'angle'"):
         xr.Dataset({"a": ("x", [1.0])}).gyro.davar()
+    product = synthetic.product()
+    assert repr(product.N.gyro).startswith("<gyrostab coefficient: axis")
+    with pytest.raises(SchemaError, match=r"this is angle random walk .* by window, not a gyro"):
+        product.N.gyro.plot()
 
 
 @pytest.mark.parametrize(

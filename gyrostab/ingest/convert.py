@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +13,7 @@ import pandas as pd
 import xarray as xr
 
 from gyrostab.errors import (
+    GyrostabError,
     MissingUnitError,
     OptionError,
     SchemaError,
@@ -48,10 +52,25 @@ def as_log(data: Any) -> xr.Dataset:
         unknown.
     """
     if isinstance(data, xr.DataArray):
-        return as_uniform(_dataset_of(data, None, None)[0])
+        with _advise_conversion("gyrostab.from_dataarray(da, ...)"):
+            return as_uniform(_dataset_of(data, None, None)[0])
     if isinstance(data, pd.DataFrame | pd.Series):
-        return from_dataframe(data)
+        with _advise_conversion("gyrostab.from_dataframe(df, ...)"):
+            return from_dataframe(data)
     return as_uniform(_keep_on_disk(data) if isinstance(data, xr.Dataset) else data)
+
+
+@contextmanager
+def _advise_conversion(call: str) -> Iterator[None]:
+    """Let errors that advise options of a conversion name the function that takes them."""
+    try:
+        yield
+    except GyrostabError as error:
+        if re.search(r"\b(kind|map|max_gap|rate|units)=", str(error)) and "gyrostab." not in str(
+            error
+        ):
+            error.args = (f"{error}; {call} has these options and returns a log",)
+        raise
 
 
 def _keep_on_disk(log: xr.Dataset) -> xr.Dataset:
@@ -150,6 +169,11 @@ def from_dataarray(
 
 def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[xr.Dataset, bool]:
     """Convert an array to a log with unchecked time; also return whether it has increments."""
+    if "unit_label" in da.attrs:
+        raise SchemaError(
+            f"this is {da.attrs.get('long_name', da.name)} by window, not a gyro signal; give the "
+            "log, or the whole product"
+        )
     if set(da.dims) not in ({"time"}, {"axis", "time"}):
         raise SchemaError(
             f"the DataArray has dimensions {da.dims}; a log has 'time', or 'axis' and 'time': "

@@ -38,6 +38,11 @@ _FILE_ADVICE = (
         "check the time column and its unit, or leave it out (--map) and give --rate HZ",
         "correct the times, or use gyrostab.make_log(values, rate=..., unit=...)",
     ),
+    (
+        "leave out --rate to use the stamps, or correct --rate, --epoch or the unit of the time "
+        "column",
+        "leave rate out to use the times, or correct the times",
+    ),
 )
 
 
@@ -59,9 +64,9 @@ def from_dataframe(
         ...), with a DatetimeIndex (UTC, or with a time zone) that does not run backwards. Samples
         may be missing.
     units : str or mapping, optional
-        Unit of all gyro columns (``"deg/s"``), or units by column (``{"gyro": "deg/s",
-        "temperature": "degC"}``). By default those in the names of the columns (``"gyro_x
-        [deg/s]"``), or in ``df.attrs["units"]``.
+        Unit of all gyro columns (``"deg/s"``), also of angles (``"deg"``), or units by column
+        (``{"gyro": "deg/s", "temperature": "degC"}``). By default those in the names of the columns
+        (``"gyro_x [deg/s]"``), or in ``df.attrs["units"]``.
     map : mapping, optional
         Column name -> contract name: ``{"wx": "gyro_x"}``; ``"-"`` drops a column.
     kind : {"rate", "angle"}, optional
@@ -159,11 +164,12 @@ def _read_frame(
         raw = read_columns(plan, len(table), fetch)
         check_options([raw])
     except MissingUnitError as error:
-        problem = str(error).split("; give")[0]
+        problem, _, advice = str(error).partition("; give")
+        stem, unit = ("angle", "deg") if "--unit angle=" in advice else ("gyro", "deg/s")
         raise MissingUnitError(
-            f"{problem}; give it: gyrostab.from_dataframe(df, units='deg/s'), "
-            "units={'gyro': 'deg/s', 'temperature': 'degC'}, df.attrs['units'] = 'deg/s', or the "
-            "name of the column, 'gyro_x [deg/s]'"
+            f"{problem}; give it: gyrostab.from_dataframe(df, units={unit!r}), "
+            f"units={{{stem!r}: {unit!r}, 'temperature': 'degC'}}, df.attrs['units'] = {unit!r}, "
+            f"or the name of the column, '{stem}_x [{unit}]'"
         ) from error
     return raw
 
@@ -210,6 +216,7 @@ def _check_index(table: pd.DataFrame) -> pd.DatetimeIndex:
     index: Any = table.index
     columns: Any = table.columns
     if not isinstance(index, pd.DatetimeIndex):
+        dated = [repr(name) for name, kind in table.dtypes.items() if kind.kind == "M"]
         advice = (
             "transpose it: df.T"
             if isinstance(columns, pd.DatetimeIndex)
@@ -217,7 +224,7 @@ def _check_index(table: pd.DataFrame) -> pd.DatetimeIndex:
             if isinstance(index, pd.PeriodIndex)
             else "convert it: df.set_index(df.index.to_datetimeindex(time_unit='ns'))"
             if isinstance(index, xr.CFTimeIndex)
-            else "set one: df.set_index(pd.DatetimeIndex(...))"
+            else f"set one: df.set_index({next(iter(dated), 'pd.DatetimeIndex(...)')})"
         )
         raise SchemaError(
             f"the index of the DataFrame holds {index.inferred_type}, not times; {advice}"

@@ -165,7 +165,14 @@ def open_content(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Da
     SchemaError, TimeError
         When it holds a log of other units, or one whose time is not uniform.
     """
-    dataset = open_dataset(path, strict=strict)
+    try:
+        dataset = open_dataset(path, strict=strict)
+    except DamageError as error:
+        if not is_text_log(Path(path)):
+            raise
+        raise FormatError(
+            f"{path}: is a text file; gyrostab.read_log reads logs of other programs"
+        ) from error
     if any(name in dataset.data_vars for name in SIGNAL_UNITS):
         return _restore_log(dataset, path)
     if "gyrostab_content" not in dataset.attrs and find_kind(dataset) == "dataset":

@@ -539,6 +539,14 @@ class TestDataFrame:
         log = gyrostab.from_dataframe(hot, units={"gyro": "deg/h", "temperature": "K"})
         np.testing.assert_allclose(log.temperature, 26.85)
 
+    @pytest.mark.filterwarnings("ignore::UserWarning")
+    @pytest.mark.parametrize("units", ["deg", {"gyro": "deg"}, {"angle": "deg"}])
+    def test_units_of_angles(self, units):
+        x = record()
+        angles = self.frame(x, ("angle_x", "angle_y"))
+        log = gyrostab.from_dataframe(angles, units=units, kind="angle")
+        np.testing.assert_array_equal(log.angle, x)
+
     @pytest.mark.parametrize("names", [("x", "y", "z"), ("X", "y", "z [deg/h]")])
     def test_a_map_overrules_the_names_x_y_z(self, names):
         x = record()[:, :50]
@@ -564,11 +572,11 @@ class TestDataFrame:
             match=r"'gyro_x' carries no unit; give it: gyrostab\.from_dataframe\(df, units='deg/s'",
         ):
             gyrostab.davar(self.frame(x), window="8s")
-        for function in (gyrostab.regularise, gyrostab.fit_noise, gyrostab.plot_davar):
+        for function in (
+            gyrostab.regularise, gyrostab.fit_noise, gyrostab.plot_davar, gyrostab.gap_table,
+        ):  # fmt: skip
             with pytest.raises(SchemaError, match=r"this is a DataFrame.*gyrostab\.from_dataframe"):
                 function(self.frame(x))
-        with pytest.raises(SchemaError, match="no table of gaps"):
-            gyrostab.gap_table(self.frame(x))
         foreign = make(x).assign(rate=make(x).rate.assign_attrs(units="deg/s"))
         with pytest.raises(SchemaError, match=r"gyrostab\.from_dataarray\(dataset\['rate'\]\)"):
             gyrostab.davar(foreign, window="8s")
@@ -576,6 +584,14 @@ class TestDataFrame:
             gyrostab.davar(self.frame(x).T, window="8s")
         with pytest.raises(SchemaError, match="not times"):
             gyrostab.davar(self.frame(x).reset_index(drop=True), window="8s")
+        with pytest.raises(SchemaError, match=r"set one: df\.set_index\('when'\)"):
+            gyrostab.davar(self.frame(x).reset_index(names="when"), window="8s")
+        angles = self.frame(x, ("angle_x", "angle_y"))
+        with pytest.raises(MissingUnitError, match=r"'angle_x' carries .*\(df, units='deg'\)"):
+            gyrostab.from_dataframe(angles)
+        angles.attrs["units"] = "deg"
+        with pytest.raises(OptionError, match=r"kind='angle' .*; gyrostab\.from_dataframe\(df, "):
+            gyrostab.davar(angles, window="8s")
         with pytest.raises(TimeError, match=r"sort it: df\.sort_index"):
             gyrostab.from_dataframe(self.frame(x)[::-1], units="deg/h")
         with pytest.raises(GyrostabError, match="no gyro column"):
@@ -692,6 +708,7 @@ def make_table(**columns) -> pd.DataFrame:
     (make_table(gyro_x=None)[:1], {"units": "deg/h"}, "give it with rate=HZ"),
     (make_table(gyro_x=None).set_index(pd.DatetimeIndex(["2026-03-01"] * 200)),
      {"units": "deg/h"}, "all stamps are the same.*make_log"),
+    (make_table(gyro_x=None), {"units": "deg/h", "rate": 70.0}, "leave rate out to use the times"),
 ])  # fmt: skip
 def test_errors_on_tables_advise_keywords_and_nothing_of_files(table, options, expected):
     with pytest.raises(GyrostabError, match=expected) as raised:

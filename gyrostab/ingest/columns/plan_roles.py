@@ -136,7 +136,7 @@ def _plan_axis(plan: Plan, column: Header) -> str | None:
     assert match is not None
     stem, axis = match.groups()
     example, allowed = ("deg/s", ("rate", "angle")) if stem == "gyro" else ("deg", ("angle",))
-    keys = [column.low, column.key, column.header, stem]
+    keys = [column.low, column.key, column.header, stem, "gyro"]  # "gyro" is any gyro axis
     text = plan.find_unit(column, keys, column.unit, lambda written: is_unit_of(written, allowed))
 
     def refuse(error: type[UnitError], problem: str, quantity: str | None = None) -> None:
