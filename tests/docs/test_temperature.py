@@ -37,5 +37,6 @@ def test_the_script_takes_the_bias_out(tmp_path, monkeypatch, parameters):
     monkeypatch.chdir(tmp_path)
     scope: dict = {}
     exec(re.search(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S)[1], scope)
+    assert np.isfinite(scope["rate"]).all()
     means = scope["product"]["window_mean"].values
     assert np.ptp(means) < 0.01 * np.ptp(scope["log"]["rate"].values)
