@@ -50,9 +50,9 @@ def fit_noise(
     tau_min, tau_max : float or str, optional
         Averaging times to fit [s]. By default all, but of a sensor with a filter those that are
         longer than the memory of the filter, whose effect on white noise is taken into account; up
-        to 24 windows are computed at once to find it (`gyrostab.allan.band_limit`). With a number,
-        or ``"all"``, no filter is sought: start above effects that are not noise, such as a
-        spectral line or resets of the feedback.
+        to 24 windows are computed at once to find it (``docs/method.md``). With a number, or
+        ``"all"``, no filter is sought: start above effects that are not noise, such as a spectral
+        line or resets of the feedback.
     observed_only : bool
         Give a coefficient and its standard error only where the term is observed, a limit only
         where it is not, and NaN elsewhere. With False they are given for every window, for the
@@ -67,7 +67,7 @@ def fit_noise(
         term is not observed), ``N_squared, K_squared``, ``fit_chi2``, ``fit_dof``;
         ``observable(axis, time, term)``: 0 not observable, 1 upper limit only, 2 observed (noise
         without the term would do that in 1 % of windows, at most 3 %). No term is observed in a
-        window that the five terms do not describe: see `is_described`. ``edf`` is that of the
+        window that the five terms do not describe (``docs/method.md``). ``edf`` is that of the
         fitted noise if all averaging times are fitted, else (with more than 48 of them, or with
         `tau_min` or `tau_max`) that of the surface. Per axis: ``fit_tau_min``, the shortest
         averaging time of the fit [s], and ``filter_time_constant`` [s], 0 if no filter was found;

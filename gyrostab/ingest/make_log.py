@@ -134,7 +134,9 @@ def _channel_variable(name: str, channel: Any, size: int) -> xr.Variable:
         )
     quantity = quantity_of(name)
     example = example_unit(quantity)
-    if not (isinstance(channel, tuple | list) and len(channel) == 2 and isinstance(channel[1], str)):
+    if not (
+        isinstance(channel, tuple | list) and len(channel) == 2 and isinstance(channel[1], str)
+    ):
         raise MissingUnitError(
             f"channel {name!r} carries no unit; give values and unit: "
             f"channels={{{name!r}: (values, {example!r})}}"

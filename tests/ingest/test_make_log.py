@@ -27,7 +27,9 @@ VALUES = np.random.default_rng(1).standard_normal(50)
 )
 def test_anything_like_an_array_is_accepted(given):
     log = make_log(given, rate=10.0, unit="deg/h")
-    assert log.chunks == ({"axis": (1,), "time": (20, 20, 10)} if isinstance(given, da.Array) else {})
+    assert log.chunks == (
+        {"axis": (1,), "time": (20, 20, 10)} if isinstance(given, da.Array) else {}
+    )
     np.testing.assert_array_equal(log.rate.values[0], VALUES)
 
 
@@ -57,7 +59,11 @@ def test_infinite_values_are_missing(to_array):
         ({"channels": {"time": (VALUES, "1")}}, OptionError, "'time': variables of gyrostab"),
         ({"channels": {"temperature": (VALUES, "V")}}, UnitError, "unit of voltage, not of temp"),
         ({"channels": {"accel_x": (VALUES[1:], "g")}}, OptionError, r"shape \(49,\).* 50 samples"),
-        ({"channels": {"vibration": VALUES}}, MissingUnitError, r"\{'vibration': \(values, 'g'\)\}"),
+        (
+            {"channels": {"vibration": VALUES}},
+            MissingUnitError,
+            r"\{'vibration': \(values, 'g'\)\}",
+        ),
         ({"channels": {"pump": (["on"] * 50, "1")}}, OptionError, "of channel 'pump' are of type"),
     ],
 )
