@@ -185,7 +185,8 @@ def find_fit_from(product: xr.Dataset) -> float | None:
     failing = [summary.axis for summary in summarise_fit(judged) if summary.fails]
     if not failing:
         return None
-    used = np.flatnonzero(np.isfinite(judged["fit_chi2"].sel(axis=failing)).any("axis").values)
+    is_fitted = np.isfinite(judged["fit_chi2"].sel(axis=failing).transpose("axis", "time").values)
+    used = np.flatnonzero(is_fitted.any(axis=0))
     places = np.linspace(0, used.size - 1, min(_MAX_TRIED_WINDOWS, used.size))
     tried = used[np.unique(places.round().astype(int))]
     windows = product.sel(axis=failing).isel(time=tried).compute()

@@ -119,7 +119,7 @@ def _align_channel(
     ]
 
 
-def _convert_units(channel: xr.DataArray, what: str) -> tuple[float, float, str]:
+def _convert_units(channel: xr.DataArray, expression: str) -> tuple[float, float, str]:
     """Return factor and offset to the inner unit of a channel, and that unit.
 
     A unit that is not known, such as m/s, is kept.
@@ -128,7 +128,7 @@ def _convert_units(channel: xr.DataArray, what: str) -> tuple[float, float, str]
     if text is None:
         raise MissingUnitError(
             f"channel {str(channel.name)!r} has no units; set them, for instance "
-            f"{what}.attrs['units'] = 'degC' ('1' for a number without a unit)"
+            f"{expression}.attrs['units'] = 'degC' ('1' for a number without a unit)"
         )
     try:
         unit = parse_unit(str(text))

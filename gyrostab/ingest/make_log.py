@@ -104,15 +104,15 @@ def make_log(
     return log
 
 
-def _real_numbers(values: Any, what: str) -> Any:
+def _real_numbers(values: Any, label: str) -> Any:
     """Return an array, in dask if it is, with NaN in the place of infinite values."""
     try:
         data = values if isinstance(values, da.Array) else np.asarray(values)
     except ValueError as error:  # rows of different lengths
-        raise OptionError(f"{what} are not an array: {error}") from error
+        raise OptionError(f"{label} are not an array: {error}") from error
     if data.dtype.kind not in "biuf":
         raise OptionError(
-            f"{what} are of type {data.dtype}; give real numbers, and NaN where one is missing"
+            f"{label} are of type {data.dtype}; give real numbers, and NaN where one is missing"
         )
     if data.dtype.kind != "f":
         return data

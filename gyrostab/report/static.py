@@ -162,7 +162,9 @@ def _draw_region(panel: Axes, shape: Any) -> None:
     """Shade or frame a region, and write its label at the upper left."""
     from matplotlib.dates import date2num
 
-    begin, end = date2num([np.datetime64(x.removesuffix("Z")) for x in (shape.x0, shape.x1)])
+    begin, end = date2num(  # type: ignore[no-untyped-call]
+        [np.datetime64(x.removesuffix("Z")) for x in (shape.x0, shape.x1)]
+    )
     is_full_height = shape.yref.endswith("domain")
     place = panel.get_xaxis_transform() if is_full_height else panel.transData
     panel.fill(
