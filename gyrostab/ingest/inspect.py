@@ -98,6 +98,7 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
     names = {f"column_{place}": column for place, column in enumerate(data_columns[:MAX_COLUMNS])}
     chosen = {column.key: f"{name} [1]" for name, column in names.items()}
     chosen.update({column.key: "-" for column in data_columns[MAX_COLUMNS:]})
+    chosen.update({key: "-" for key, target in options.map.items() if target in ("", "-")})
     has_unit = time is not None and time.unit not in (None, "ISO 8601", *UNREADABLE)
     unit = {"time": str(time.unit)} if time is not None and has_unit else {}
     is_column = time is not None and (time.key != "time" or time.unit in UNREADABLE)

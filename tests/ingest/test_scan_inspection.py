@@ -398,13 +398,13 @@ def test_file_without_a_gyro_is_inspected(tmp_path: Path, capsys) -> None:
 
 
 def test_file_that_no_guess_reads_ends_with_its_error(tmp_path: Path, capsys) -> None:
-    cells = np.where(np.arange(ROWS) % 5 < 3, "****", "1.5")
+    cells = np.where(np.arange(ROWS) % 5 < 3, "****", GX.astype(str))
     rows = "".join(f"{time},{cell}\n" for time, cell in zip(TIME, cells, strict=True))
     for header in ("gyro_x [deg/h]", "wx"):
         (tmp_path / "half.csv").write_text(f"time [s],{header}\n{rows}")
         assert call("scan", tmp_path / "half.csv") == 2
         shown = capsys.readouterr()
-        assert "# half.csv: 2 columns" in shown.out
+        assert "half.csv: 2 columns" in shown.out
         assert "of 3000 rows are unreadable" in shown.err
         assert (shown.out + shown.err).count("unreadable") == 1
         assert "next:" not in shown.out
@@ -439,6 +439,8 @@ def test_columns_of_a_file_with_unreadable_stamps_are_printed(
     assert message in shown.err
     assert message not in shown.out
     given = ["--map", "TIME=-", "--rate", "100", "--start", "2026-05-03T23:50"]
+    assert call("scan", path, *given) == 2
+    assert {"TIME=-", "wx=gyro_x"} < set(next_command(capsys.readouterr().out))
     assert call("scan", path, *given, "--map", "wx=gyro_x", "--unit", "gyro=deg/s") == 0
 
 

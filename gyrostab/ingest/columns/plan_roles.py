@@ -317,9 +317,9 @@ def _plan_channel(
 def _describe_lack(path: Path, columns: Sequence[FileColumn]) -> str:
     """Say that no column is a gyro axis, and how to name the likely ones."""
     headers = [column for column in distinct_columns(columns) if column.header]
-    free = [c for c in headers if not TIME_PATTERN.match(c.low) and _may_be_axis(c)]
+    free = [c for c in headers if not TIME_PATTERN.match(c.low) and quantity_of(c.low) is None]
     candidates = (c for pattern in GYRO_PATTERNS for c in free if pattern.search(c.name))
-    likely = next(candidates, free[0] if free else None)
+    likely = next(candidates, next(filter(_may_be_axis, free), None))
     advice = f"If it holds channels of another log, give it as --channel {shlex.quote(path.name)}"
     if likely is not None:
         example = f'--map "{likely.key}=gyro_x"{_axis_options(likely)}'
@@ -343,10 +343,10 @@ def _axis_options(column: Header) -> str:
 
 
 def _may_be_axis(column: Header) -> bool:
-    """Return whether name, unit and values of a column allow a gyro axis."""
+    """Return whether unit and values of a column allow a gyro axis."""
     unit = column.unit or column.stored or "1"
     has_other_unit = is_unit(unit) and not is_unit_of(unit, ("rate", "angle", "number"))
-    return not (has_other_unit or column.file.stamped or quantity_of(column.low))
+    return not (has_other_unit or column.file.stamped)
 
 
 def scan_advice(path: Path) -> str:
