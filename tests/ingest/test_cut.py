@@ -221,7 +221,7 @@ def test_commands_accept_the_options(files, tmp_path, capsys):
         assert surface.sizes["time"] == len(avar)
     capsys.readouterr()
     assert main(["scan", *files["own"], *cut]) == 0
-    assert "2026-03-01 10:01:00" in capsys.readouterr().out
+    assert "2026-03-01T10:01:00" in capsys.readouterr().out
     assert main(["ingest", *files["own"], "-o", str(tmp_path / "none.nc"), "--from", "1h"]) == 2
     assert "outside the record" in capsys.readouterr().err
     (tmp_path / "some.toml").write_text('[ingest]\nfrom = "1min"\nexclude = ["90s/100s"]\n')
