@@ -138,7 +138,7 @@ def guess_columns(
             f"{column.key!r} rises from row to row in {column.unit}, which is not a unit of time: "
             "if the log is over depth, export it over time"
             for column in inspection.columns
-            if column.unit and not is_unit(column.unit) and _rises(column, inspection)
+            if column.unit and not is_unit(column.unit) and _rises_by_row(column, inspection)
         ]
     sampling = (
         rate
@@ -199,7 +199,7 @@ def _unit_seconds(unit: str | None) -> float:
     return float(parse_time_unit(unit or "s").ns) / 1e9
 
 
-def _rises(column: ColumnInspection, inspection: FileInspection) -> bool:
+def _rises_by_row(column: ColumnInspection, inspection: FileInspection) -> bool:
     """Return whether a column rises from row to row, as time does."""
     return (
         column.rows >= max(2, 0.5 * inspection.rows)
@@ -214,7 +214,7 @@ def _guess_time(
 ) -> tuple[ColumnInspection | None, str | None]:
     best: tuple[float, ColumnInspection, str, str] | None = None
     for column in inspection.columns:
-        if not _rises(column, inspection):
+        if not _rises_by_row(column, inspection):
             continue
         low = column.key.lower()
         named = bool(TIME_PATTERN.match(low) or _TIME_WORD.search(low))

