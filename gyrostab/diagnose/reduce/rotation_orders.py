@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 #: Multiples of the tool rotation that are measured.
 HARMONICS = (1, 2, 3)
 _NEIGHBOUR_TURNS = (1, 5)  # range, turns per block from an order at which its noise is measured
+#: Variance of an amplitude in the samples that are there, over that of an even rotation, 2 / n.
+#: Design choice: the error assumed is too small by 30 % at most.
+_MAX_VARIANCE_RATIO = 2.0
 _MIN_TURNS_APART = 0.9  # turns per block from a line that was removed; just below one DFT bin
 
 
@@ -104,7 +107,8 @@ def _fit_harmonics(
     Where the rotation is uneven, as in stick-slip, or samples are missing, harmonics are not
     orthogonal: products with each of them would show the first one in all. The errors used later
     are those of an even rotation. Stick-slip of 0.6 once per turn has 1.2 times their variance, of
-    0.9 up to 1.4 times.
+    0.9 up to 1.4 times. Blocks with more than `_MAX_VARIANCE_RATIO` times it are not fitted, such
+    as those whose samples from a turn were lost.
 
     Parameters
     ----------
@@ -131,7 +135,13 @@ def _fit_harmonics(
         present, fitted = values[axis, block] != 0.0, is_sampled[block]
         columns = basis[block][present][:, np.repeat(fitted, 2)]
         with_constant = np.column_stack([columns, np.ones(len(columns))])
-        sizes = np.linalg.lstsq(with_constant, values[axis, block, present], rcond=None)[0][:-1]
+        left, scale, right = np.linalg.svd(with_constant, full_matrices=False)
+        with np.errstate(divide="ignore"):
+            inverse = right.T / scale
+        variance = (inverse**2).sum(axis=1)[:-1]
+        if not (variance * len(columns) / 2.0 < _MAX_VARIANCE_RATIO).all():
+            continue
+        sizes = (inverse @ (left.T @ values[axis, block, present]))[:-1]
         amplitudes[axis, block, fitted] = sizes[::2] - 1j * sizes[1::2]
         residual[axis, block, present] -= columns @ sizes
     return amplitudes, residual
