@@ -10,6 +10,7 @@ import xarray as xr
 
 from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.predict.candidates import Component, Variant
+from gyrostab.diagnose.predict.grid_refinement import Point, refine_grid
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.registry import effects
@@ -130,7 +131,7 @@ def prefer_plainer(component: Component, state: State) -> Component:
     terms = {
         name: variant
         for name in dict.fromkeys(names)
-        if (variant := _single_term_variant(component, name)) is not None
+        if (variant := _single_term_variant(component, state, name)) is not None
     }
     gains = {name: _explained_nats(component, state, variant) for name, variant in terms.items()}
     if is_single:  # rounding or chance may have put another term ahead
@@ -174,13 +175,23 @@ def _describe_unseparated(name: str, other_names: Sequence[str]) -> str:
     )
 
 
-def _single_term_variant(component: Component, name: str) -> Variant | None:
-    """Return the variant of the same values with this term alone."""
-    for variant in component.candidate.variants:
-        if (
-            variant.columns == (name,)
-            and variant.squared == component.variant.squared
-            and variant.values == component.variant.values
-        ):
-            return variant
-    return None
+def _single_term_variant(component: Component, state: State, name: str) -> Variant | None:
+    """Return the variant with this term alone, and the same texts, that explains most.
+
+    That of a component of several terms may lie between the points of the grid: two terms of one
+    point together can take the form of a single one between two points.
+    """
+    single = replace(component.variant, columns=(name,))
+    variants = [
+        variant
+        for variant in component.candidate.variants
+        if variant.has_columns_of(single) and variant.texts == component.variant.texts
+    ]
+    if variants and len(component.variant.columns) > 1:
+        grid = [
+            Point(variant, component_mixture(component, state, variant)) for variant in variants
+        ]
+        variants = [point.variant for point in refine_grid(component, state, grid)]
+    return max(
+        variants, key=lambda variant: _explained_nats(component, state, variant), default=None
+    )

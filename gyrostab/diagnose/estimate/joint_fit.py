@@ -32,6 +32,12 @@ from gyrostab.physics.registry import effects
 
 _ANGLE = "deg"
 _TAIL = float(ndtr(-NORMAL_95))  # beyond either end of an interval
+#: Settings of effects that are the same in every model.
+_FIXED_SETTINGS: Mapping[str, dict[str, Any]] = {
+    "rotation_line": {"harmonics": 1.0},
+    "misalignment": {"motion": "recorded"},
+    "spikes": {"kind": "outlier"},
+}
 _PLACE = "frequency"  # of a line: where it is does not depend on what makes it
 
 
@@ -263,8 +269,6 @@ def _model_settings(
     identification: Selection, component: Component, state: State
 ) -> dict[str, Any]:
     """Return settings that the model needs in addition to the sizes."""
-    if identification.effect == "rotation_line":
-        return {"harmonics": 1.0}
     if identification.effect == "spectral_line" and component.statistic.is_line:
         return {
             "quality": line_quality(state.blocks, state.baseline, component.row[0], component.place)
@@ -279,8 +283,6 @@ def _model_settings(
         return {"fill": "frame" if are_frames else "repeat"}
     if identification.effect == "clipping":
         return {"centre": centre_of_range(state.blocks.sel(axis=component.row[0]))}
-    if identification.effect == "misalignment":
-        return {"motion": "recorded"}
     if (
         identification.effect == "rate_quantization"
         and truncated_axes(state.blocks)[state.axes.index(component.row[0])]
@@ -291,12 +293,12 @@ def _model_settings(
         centre = float(np.nan_to_num(state.blocks["zone_centre"].sel(axis=axis)))
         edge = "jump" if has_empty_zone(state.blocks, axis) else "offset"
         return {"centre": centre, "edge": edge}
-    if identification.effect == "spikes":
-        return {"kind": "outlier"}
+    if identification.effect == "warm_up" and state.blocks.sizes["restart"]:
+        return {"gap": float(state.blocks.attrs["restart_gap_s"])}
     if identification.effect == "earth_rate" and is_reversed(component):
         off, around = np.degrees(EarthRate.example().directions(identification.axes))
         return {"off": list(off), "around": list(-around)}
-    return {}
+    return {**_FIXED_SETTINGS.get(identification.effect, {})}
 
 
 def _make_effect(

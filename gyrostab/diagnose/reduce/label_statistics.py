@@ -118,9 +118,8 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     if work.ramp is not None:
         variables |= label_variables({"ramp_turns": by_name["ramp_turns"][0]})
         variables["ramp_turns"][2].update(zip(("low", "high"), work.ramp_range, strict=True))
-    return xr.Dataset(
-        variables, coords=_make_coordinates(work, log), attrs=_make_attributes(work, log, present)
-    )
+    attrs = _make_attributes(work, log, present) | {"restart_gap_s": restart}
+    return xr.Dataset(variables, coords=_make_coordinates(work, log), attrs=attrs)
 
 
 def _kept_values(work: Accumulator, row: int, max_per_block: int | None = None) -> Array:
