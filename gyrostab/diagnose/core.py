@@ -250,8 +250,11 @@ def _leave_out_motion(task: Task, named: NamedBlocks) -> NamedBlocks | None:
     """Identify without unexplained motion; None without any, or if too little is left."""
     if task.simulation is not None:
         return None
-    blocks, identified = named.blocks, named.identifications.identified
-    moving = unexplained_motion(blocks, identified, settings=task.settings)
+    blocks, identifications = named.blocks, named.identifications
+    state = replace(
+        identifications.start_state(named.baseline), weight=identifications.state.weight
+    )
+    moving = unexplained_motion(blocks, identifications.identified, state)
     if not moving.any():
         return None
     try:

@@ -9,37 +9,45 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.identify.identification import Selection, components_of
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
+from gyrostab.diagnose.predict.linear_model import State, band_widths
 from gyrostab.diagnose.reduce.moving_blocks import (
     moving_blocks,
     moving_blocks_of_axis,
     sample_range,
 )
 from gyrostab.diagnose.reduce.schema import axis_values
-from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.settings import Settings
 
 Array = NDArray[np.float64]
 
 
 def unexplained_motion(
-    blocks: xr.Dataset, identified: Iterable[Selection], *, settings: Settings = DEFAULTS
+    blocks: xr.Dataset, identified: Iterable[Selection], state: State
 ) -> NDArray[np.bool_]:
-    """Find the moving blocks of axes without an effect that explains the means.
+    """Find the moving blocks of axes without an effect that explains the motion.
 
-    An effect on the means must leave next to nothing of the motion. It is not enough that it adds
-    evidence: a step or a drifting channel also explains a part of an intermittent rotation. Two
-    levels have their course from the means themselves, hence no error of form: they must leave the
-    axis at rest.
+    An effect must leave next to nothing of the motion, in the means or, where it follows a channel
+    sample by sample, in the power. It is not enough that it adds evidence: a step or a drifting
+    channel also explains a part of an intermittent rotation. Two levels, or several steps, have
+    their course from the means themselves, hence no error of form: they must leave the axis at
+    rest.
+
+    Parameters
+    ----------
+    state : State
+        Without any effect, weighted with all of them.
 
     Returns
     -------
     ndarray of bool, shape (axis, block)
     """
-    components = components_of(identified)
+    components, settings = components_of(identified), state.settings
     explained_axes = {
         axis
         for component in components
-        if component.statistic.explains_motion
+        if component.statistic.moves_means(component)
         for axis in component.row
     }
     moving = moving_blocks(blocks, settings=settings)
@@ -55,7 +63,8 @@ def unexplained_motion(
             for component in axis_components
             for column in mean_columns(component.variant, row)
         ]
-        if axis in explained_axes or (
+        has_cause = axis in explained_axes or _explains_power(components, axis, moving[row], state)
+        if has_cause or (
             columns
             and _is_explained(
                 axis_values(blocks, "mean", axis),
@@ -63,11 +72,34 @@ def unexplained_motion(
                 np.stack(columns, axis=1),
                 span,
                 settings,
-                has_form=not any(component.statistic.is_switching for component in axis_components),
+                has_form=not any(component.statistic.is_switching for component in axis_components)
+                and sum(component.is_step for component in axis_components) < 2,
             )
         ):
             moving[row] = False
     return moving
+
+
+def _explains_power(
+    components: Iterable[Component], axis: str, moving: NDArray[np.bool_], state: State
+) -> bool:
+    """Return whether what follows channels leaves next to nothing of the power in a motion."""
+    followers = [
+        component
+        for component in components
+        if component.statistic.is_transfer and component.row == (axis,)
+    ]
+    if not followers:
+        return False
+    measured = axis_values(state.blocks, "power", axis)
+    predicted = np.zeros_like(measured)
+    for component in followers:
+        power, *_ = component.statistic.noise_shares(component, axis, state, state.weight)
+        predicted += power
+    good = np.isfinite(measured) & moving[:, None]
+    width = np.broadcast_to(band_widths(state.blocks), measured.shape)[good]
+    left = width @ np.abs(measured - predicted)[good]
+    return float(left) <= state.settings.spectrum_error_share * float(width @ measured[good])
 
 
 def _is_explained(

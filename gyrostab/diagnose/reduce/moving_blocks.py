@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.ndimage import binary_propagation
 
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.noise import NORMAL_95
 from gyrostab.progress import Stage, no_stage
 
 Array = NDArray[np.float64]
@@ -74,10 +76,12 @@ def moving_blocks_of_axis(mean: Array, span: float, settings: Settings) -> NDArr
     is_moving = good & ~is_at_rest
     if is_moving.sum() < 2:  # a motion lasts; a single block is an outlier
         return nothing
-    place = np.flatnonzero(good)
+    place = np.flatnonzero(good)  # neighbours are those among the blocks that are there
+    has_left_rest = (away > NORMAL_95 * scale)[place]
+    whole_motion = binary_propagation(is_moving[place], mask=has_left_rest)  # from rest to rest
     is_near_motion = (
-        np.convolve(is_moving[place], np.ones(2 * settings.motion_margin_blocks + 1), "same") > 0.5
-    )  # neighbours among the blocks that are there
+        np.convolve(whole_motion, np.ones(2 * settings.motion_margin_blocks + 1), "same") > 0.5
+    )
     out = nothing.copy()
     out[place] = is_near_motion
     has_rest = (

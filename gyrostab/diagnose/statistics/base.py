@@ -102,7 +102,6 @@ class Statistic:
     is_line = False  # a spectral line,
     is_count = False  # anomalous samples
     has_course = False  # whether designs are by block
-    explains_motion = False  # whether an effect without columns in the means explains their motion
     has_size = True  # whether the size follows from a linear model
     uses_line_spectra = False  # whether the score is of the spectrum at full resolution
     is_ratio = False  # whether the score is of a variance over the expected one
@@ -251,8 +250,14 @@ class Statistic:
         These are a power of known size (block, band), and powers and means of free size. The state
         is that without any effect, `weight` (axis, block, band) the powers with all effects.
         """
-        columns = self.condition(state, component).given if self.takes_noise else {}
-        return 0.0, columns.get(("power", axis), []), columns.get(("mean", axis), [])
+        if not self.takes_noise:
+            return 0.0, [], []
+        with_component = self.condition(state, component)
+        return 0.0, with_component.power_columns(axis), with_component.given.get(("mean", axis), [])
+
+    def moves_means(self, component: Component) -> bool:
+        """Return whether a component without columns in the means moves them all the same."""
+        return False
 
     def has_power_of_effect(self, component: Component, state: State) -> bool:
         """Return whether only the effect itself, and no column, gives the power of a component."""

@@ -48,7 +48,6 @@ class RotationOrder(Statistic):
     is_power_weighted = True
     is_phase_locked = True
     is_rotation = True
-    explains_motion = True
 
     def null(self, draw: NullDraw) -> Mapping[str, Array]:
         """Draw Gaussian amplitudes at the rotation orders, with the density near that frequency."""
@@ -128,6 +127,10 @@ class RotationOrder(Statistic):
                 wide[:, place * 2 * count : (place + 1) * 2 * count] = column
                 given.append(wide)
         return linear_model(values, cell_weight, designs, given)
+
+    def moves_means(self, component: Component) -> bool:
+        """Return True: a slow rotation moves the means."""
+        return True
 
     def condition(self, state: State, component: Component) -> State:
         """Condition on a component in the rotation orders, and where it shows in the spectrum.

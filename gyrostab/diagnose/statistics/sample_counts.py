@@ -55,6 +55,7 @@ _SAMPLES = {
     "kurtosis": "a sample distribution that is not normal",
     "lattice": "values on a coarse quantization grid",
 }
+_FAR_SAMPLES = ("outliers", "stuck", "filled")  # anomalous samples that move the means
 _MAX_BLOCK_SIGMA = 4.0  # of the kurtosis of one block: the counts judge single outliers
 #: Least scatter of the scores: if null records never have one, a single one is not a mismatch.
 _MIN_SCATTER = (0.35, 0.35, 0.35, 0.35, 0.2)
@@ -70,7 +71,6 @@ class SampleCounts(Statistic):
     nuisance_alternative = "~outliers"
     error_shows_in = ("sample_counts",)
     is_count = True
-    explains_motion = True
     has_size = False
     takes_noise = False
 
@@ -166,6 +166,10 @@ class SampleCounts(Statistic):
         if blocks is state.blocks:
             return free_shape(state, component.row[0])
         return replace(state, blocks=blocks)
+
+    def moves_means(self, component: Component) -> bool:
+        """Return whether samples are far from the rate, or zero."""
+        return component.variant.columns[0] in _FAR_SAMPLES
 
     def has_power_of_effect(self, component: Component, state: State) -> bool:
         """Return whether no block is left out: with the blocks their power may be left out too."""

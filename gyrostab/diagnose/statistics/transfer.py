@@ -46,7 +46,6 @@ class Transfer(Statistic):
     error_shows_in = ("transfer",)
     is_power_weighted = True
     is_transfer = True
-    explains_motion = True
 
     def null(self, draw: NullDraw) -> Mapping[str, Array]:
         if "reference_cross" not in draw.blocks:

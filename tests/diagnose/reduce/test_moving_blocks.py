@@ -11,11 +11,14 @@ import xarray as xr
 from gyrostab import diagnose
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.unexplained_motion import unexplained_motion
+from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.reduce.block_statistics import measured, reduce_log
 from gyrostab.diagnose.reduce.moving_blocks import moving_blocks, without_motion
 from gyrostab.diagnose.result.mismatch_tables import motion_mismatches
 from gyrostab.diagnose.statistics import find_statistic
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate
@@ -108,8 +111,19 @@ def test_noise_is_calibrated_at_rest(reduced):
     assert (baseline["coefficient"].sel(term="K") < 1.0).all()
 
 
+@pytest.fixture(scope="module")
+def state(reduced) -> State:
+    whole, rest = reduced
+    return initial_state(whole, calibrate_noise(rest))
+
+
 def identification(
-    effect: str, statistic: str, *row: str, column: str = "z", course: np.ndarray | None = None
+    effect: str,
+    statistic: str,
+    *row: str,
+    column: str = "z",
+    course: np.ndarray | None = None,
+    is_step: bool = False,
 ) -> SimpleNamespace:
     design = np.empty(0) if course is None else course[None, None]
     variant, candidate = (
@@ -120,33 +134,99 @@ def identification(
         effect=effect,
         components=(
             SimpleNamespace(
-                candidate=candidate, statistic=candidate.statistic, row=row, variant=variant
+                candidate=candidate,
+                statistic=candidate.statistic,
+                row=row,
+                variant=variant,
+                is_step=is_step,
             ),
         ),
     )
 
 
-def test_effect_explains_motion_if_it_leaves_almost_nothing(reduced):
+def test_effect_explains_motion_if_it_leaves_almost_nothing(reduced, state):
     whole, _ = reduced
     moving = moving_blocks(whole)
     bump = np.nan_to_num(whole["mean"].values[2] - np.nanmedian(whole["mean"].values[2]))
     assert not unexplained_motion(
-        whole, [identification("warm_up", "mean", "z", course=0.1 * np.abs(bump) ** 1.1)]
+        whole, [identification("warm_up", "mean", "z", course=0.1 * np.abs(bump) ** 1.1)], state
     ).any()
-    assert not unexplained_motion(
-        whole, [identification("rotation_line", "rotation_order", "z")]
-    ).any()
+    for other in (
+        identification("rotation_line", "rotation_order", "z"),
+        identification("spikes", "sample_counts", "z", column="outliers"),
+    ):
+        assert not unexplained_motion(whole, [other], state).any()
     step = np.where(np.arange(bump.size) < np.flatnonzero(moving[2]).mean(), 0.0, 1.0)
     for other in (
         identification("bias_jump", "mean", "z", course=step),
         identification("warm_up", "mean", "x", course=bump),
         identification("light_power_noise", "power", "z"),
         identification("vibration_random_walk", "random_process", "z"),
+        identification("held_samples", "sample_counts", "z", column="repeats"),
     ):
-        np.testing.assert_array_equal(unexplained_motion(whole, [other]), moving)
+        np.testing.assert_array_equal(unexplained_motion(whole, [other], state), moving)
 
 
-def test_identified_jump_is_not_motion(at_rest):
+def test_several_steps_do_not_explain_a_slow_motion(reduced, state):
+    """Enough of them leave next to nothing of it, but not an axis at rest."""
+    whole, _ = reduced
+    inside = np.flatnonzero(moving_blocks(whole)[2])
+    steps = [
+        identification(
+            "bias_jump",
+            "mean",
+            "z",
+            course=np.where(np.arange(whole.sizes["block"]) < at, 0.0, 1.0),
+            is_step=True,
+        )
+        for at in inside[::2]
+    ]
+    left = unexplained_motion(whole, steps, state)
+    np.testing.assert_array_equal(left, moving_blocks(whole))
+
+
+def test_motion_ends_where_the_axis_is_at_rest_again(at_rest):
+    """The slow tails of a motion belong to it."""
+    hump = 40.0 * np.exp(-0.5 * ((np.arange(at_rest.sizes["time"]) - 6000) / 1000.0) ** 2)
+    log = at_rest.copy(deep=True)
+    log["rate"].loc[{"axis": "z"}] += xr.DataArray(hump, dims="time")
+    whole = reduce_log(log)
+    moving = moving_blocks(whole)[2]
+    mean, length = whole["mean"].values[2], whole.attrs["block_samples"]
+    scatter = float(np.std(reduce_log(at_rest)["mean"].values[2]))
+    assert moving.any()
+    assert np.abs(mean[~moving]).max() < 4.0 * scatter
+    middle = hump[length // 2 :: length][: moving.size]
+    assert np.abs(middle[~moving]).max() < 3.0 * scatter
+    assert not moving[: int(1500 / length)].any()
+
+
+@pytest.mark.parametrize("seen", [1.0, 0.5])
+def test_channel_explains_motion_if_it_sees_almost_all_of_its_power(at_rest, seen):
+    """A channel that sees only a part does not."""
+    rng = np.random.default_rng(11)
+    size = at_rest.sizes["time"]
+    hump = 400.0 * np.exp(-0.5 * ((np.arange(size) - 6000) / 1000.0) ** 2)
+    seen_motion, other_motion = hump * rng.standard_normal((2, size))
+    log = at_rest.copy(deep=True)
+    motion = hump + np.sqrt(seen) * seen_motion + np.sqrt(1.0 - seen) * other_motion
+    log["rate"].loc[{"axis": "z"}] += xr.DataArray(motion, dims="time")
+    log["seismometer"] = ("time", seen_motion, {"units": "m s-1"})
+    whole = reduce_log(log)
+    moving = moving_blocks(whole)
+    baseline = calibrate_noise(without_motion(log, whole, moving))
+    candidate = next(
+        candidate
+        for candidate in effect_candidates(whole, baseline["coefficient"])[0]
+        if candidate.reference == ("seismometer",) and candidate.effect == "real_motion"
+    )
+    component = Component(candidate, candidate.variants[-1], ("z",), 100.0)
+    named = [SimpleNamespace(effect="real_motion", components=(component,))]
+    left = unexplained_motion(whole, named, initial_state(whole, baseline))
+    np.testing.assert_array_equal(left, moving & (seen < 1.0))
+
+
+def test_identified_jump_is_not_motion(at_rest, state):
     step = np.where(np.arange(at_rest.sizes["time"]) < 8000, 0.0, 300.0)
     whole = reduce_log(at_rest.assign(rate=at_rest["rate"] + xr.DataArray(step, dims="time")))
     assert moving_blocks(whole).any(axis=1).all()
@@ -155,10 +235,10 @@ def test_identified_jump_is_not_motion(at_rest):
         identification("bias_jump", "mean", axis, course=block_count.astype(float))
         for axis in "xyz"
     ]
-    assert not unexplained_motion(whole, named).any()
+    assert not unexplained_motion(whole, named, state).any()
 
 
-def test_two_levels_explain_motion_only_if_they_leave_the_axis_at_rest(at_rest):
+def test_two_levels_explain_motion_only_if_they_leave_the_axis_at_rest(at_rest, state):
     time = np.arange(at_rest.sizes["time"])
     for rise in (1, 600):
         steps, hump = (
@@ -175,7 +255,7 @@ def test_two_levels_explain_motion_only_if_they_leave_the_axis_at_rest(at_rest):
             identification("telegraph", "telegraph", axis, course=levels["mean"].values[row])
             for row, axis in enumerate("xyz")
         ]
-        left = unexplained_motion(whole, named)
+        left = unexplained_motion(whole, named, state)
         np.testing.assert_array_equal(left, moving & (rise > 1))
 
 
