@@ -20,6 +20,7 @@ from gyrostab.diagnose.baseline.known_lines import (
     resonance_density,
 )
 from gyrostab.diagnose.baseline.sample_transfer import undo_transfer
+from gyrostab.diagnose.predict.correlated_powers import with_correlated_powers
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import (
     cross_without,
@@ -75,12 +76,12 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
     for effect, rows in _effects_on_rows(model, axes):
         of_effect = tuple(axes[row] for row in rows)
         sizes = partial(effect.expand_to_axes, axes=of_effect)
-        prediction = predict_effect(effect, blocks, of_effect)
+        prediction = with_correlated_powers(predict_effect(effect, blocks, of_effect), blocks)
         has_anomalous_samples = bool({*prediction.marks} - {_EVERYWHERE})
         if has_anomalous_samples or _shows_elsewhere(prediction):
             left_out.append(effect.name)
         left[rows] *= _share_left(effect, model, rows, blocks)
-        if has_anomalous_samples:
+        if has_anomalous_samples or _switches_slowly(prediction, blocks):
             continue  # such blocks are found and left out
         for name, values in prediction.mean.items():
             mean[rows] += sizes(name)[:, None] * values
@@ -105,7 +106,7 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
         variables["line_noise"] = _filtered_lines(model, square, blocks)
     if narrow:
         variables |= expect_lines(blocks, narrow, white_response[:, 0])
-    processes, power = _random_means(wandering, shape)
+    processes, power = random_means(wandering, shape)
     white_share = 1.0 - power / spectrum[..., 0]
     return KnownEffects(mean, spectrum, white_share, variables | processes, left_out)
 
@@ -180,7 +181,7 @@ def _added_powers(
         yield factor, density
 
 
-def _random_means(
+def random_means(
     wandering: Sequence[tuple[Prediction, list[int], Callable[[str], Array]]],
     shape: tuple[int, ...],
 ) -> tuple[dict[str, NDArray[Any]], Array]:
@@ -223,6 +224,12 @@ def _shows_elsewhere(prediction: Prediction) -> bool:
         return True
     is_shown = prediction.mean or prediction.level or prediction.spectrum
     return not is_shown and not prediction.response
+
+
+def _switches_slowly(prediction: Prediction, blocks: xr.Dataset) -> bool:
+    """Return whether a bias of levels stays on one for blocks, so that the means show when."""
+    times = [time for time, _ in prediction.wander.values()]
+    return bool(prediction.levels) and min(times, default=0.0) >= float(blocks.attrs["block_s"])
 
 
 def _is_steady(time: float, variance: Array) -> bool:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from gyrostab.diagnose.evidence.products import marginalise, mean_products, scale_columns
+from gyrostab.diagnose.evidence.wandering import RandomProcesses
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -283,6 +284,7 @@ def noise_posterior(
     use: NDArray[np.bool_],
     effects: Array | None,
     settings: Settings,
+    wander: RandomProcesses | None = None,
 ) -> Posterior:
     """Compute the posterior of Q, N, B, K of an axis from band powers and block means.
 
@@ -296,6 +298,8 @@ def noise_posterior(
         Blocks whose means are used.
     effects : ndarray, shape (block, column), optional
         Designs of effects in the means, of any size.
+    wander : RandomProcesses, optional
+        Random processes of effects in the means.
     """
     mean, step = blocks["mean"].values[row], float(blocks.attrs["block_s"])
     present, rng = use & np.isfinite(mean), np.random.default_rng(row)
@@ -306,7 +310,7 @@ def noise_posterior(
     values = np.where(present, mean, 0.0)[:, None]
     columns = scale_columns(effects, mean.size)
     products = mean_products(
-        values, columns, variance=variance, step=step, K=K, B=B, present=present
+        values, columns, variance=variance, step=step, K=K, B=B, present=present, wander=wander
     )
     least_variance = np.maximum(variance[present].min(initial=1.0), 1e-300)
     precision = _PRIOR_PRECISION * np.eye(columns.shape[1]) / least_variance

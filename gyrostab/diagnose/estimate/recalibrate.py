@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -19,6 +21,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     noise_powers,
     white_variance,
 )
+from gyrostab.diagnose.baseline.known_effects import random_means
 from gyrostab.diagnose.baseline.posterior import (
     Fit,
     Posterior,
@@ -28,7 +31,7 @@ from gyrostab.diagnose.baseline.posterior import (
     noise_posterior,
 )
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
-from gyrostab.diagnose.evidence.wandering import expected_processes
+from gyrostab.diagnose.evidence.wandering import RandomProcesses, expected_processes
 from gyrostab.diagnose.identify.identification import (
     Identifications,
     components_of,
@@ -39,6 +42,7 @@ from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, spread_by_gaps
 from gyrostab.diagnose.predict.windows import find_drivers, predict_effect, rebuild_variant
 from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
+from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.physics.base import Effect
 
 Array = NDArray[np.float64]
@@ -80,8 +84,8 @@ def recalibrate(
     Returns
     -------
     xarray.Dataset
-        As from `gyrostab.diagnose.baseline.calibrate.calibrate_noise`; ``attrs["recalibrated"]``
-        lists the axes.
+        As from `gyrostab.diagnose.baseline.calibrate.calibrate_noise`, with the steady random
+        processes of the effects in the means; ``attrs["recalibrated"]`` lists the axes.
     """
     if baseline.attrs.get("source") != "calibrated" or not identifications.identified:
         return baseline
@@ -93,6 +97,7 @@ def recalibrate(
     posteriors: list[Posterior] = []
     power = baseline["spectrum"].values.copy()
     columns = noise_powers(blocks)
+    processes = _find_processes(fitted, blocks)
     changed, quiet = [], baseline["quiet"].values.copy()
     for row, axis in enumerate(state.axes):
         axis_effects = _collect_effects(identifications, baseline, fitted, axis)
@@ -101,7 +106,8 @@ def recalibrate(
         if axis_effects is not None and not has_walk:
             has_unidentified = any(axis in selection.axes for selection in identifications.unknown)
             chosen = use & ~state.masked[row] & (quiet[row] if has_unidentified else True)
-            posterior = _fit_noise(state, row, axis_effects, chosen)
+            wander = expected_processes(baseline.assign(processes), row)
+            posterior = _fit_noise(state, row, axis_effects, chosen, wander)
             if posterior is not None:
                 changed.append(axis)
                 quiet[row] = chosen
@@ -118,11 +124,14 @@ def recalibrate(
         spectrum=power,
         settings=state.settings,
     )
+    out = out.assign(processes)
     out["columns"] = out["columns"].copy(data=columns)
     for row, axis in enumerate(state.axes):
         if axis not in changed:
             for name in _AXIS_VARIABLES:
                 out[name][row] = baseline[name].values[row]
+            for name in {"wander_square", "wander_walk"} & {*processes}:
+                out[name][row] = 0.0  # the noise that is kept contains them
     return out
 
 
@@ -247,6 +256,26 @@ def _collect_effects(
     return out if touched else None
 
 
+def _find_processes(fitted: Sequence[Fitted], blocks: xr.Dataset) -> dict[str, Any]:
+    """Return the steady random processes of effects in the means, as variables of a baseline.
+
+    The bias of two levels is one unless its course is in the model.
+    """
+    axes = [str(axis) for axis in blocks["axis"].values]
+    wandering = []
+    for effect_fit in fitted:
+        effect = effect_fit.effect
+        if effect is None:
+            continue
+        prediction = predict_effect(effect, blocks, effect_fit.axes, blocks["frequency"].values)
+        if not any(component.statistic.is_switching for component in effect_fit.components):
+            prediction = replace(prediction, levels="")
+        sizes = partial(effect.expand_to_axes, axes=effect_fit.axes)
+        wandering.append((prediction, [axes.index(axis) for axis in effect_fit.axes], sizes))
+    shape = tuple(blocks.sizes[name] for name in ("axis", "block", "band"))
+    return label_variables(random_means(wandering, shape)[0], BASELINE)
+
+
 def _effect_power(effect: Effect, blocks: xr.Dataset, axis: str) -> Array:
     """Return the power that an effect itself predicts on an axis, (block, band)."""
     prediction = predict_effect(effect, blocks, (axis,), blocks["frequency"].values)
@@ -259,7 +288,11 @@ def _effect_power(effect: Effect, blocks: xr.Dataset, axis: str) -> Array:
 
 
 def _fit_noise(
-    state: State, row: int, axis_effects: AxisEffects, chosen: NDArray[np.bool_]
+    state: State,
+    row: int,
+    axis_effects: AxisEffects,
+    chosen: NDArray[np.bool_],
+    wander: RandomProcesses,
 ) -> Posterior | None:
     """Fit the noise of an axis with the effects; None where too little is left to determine it."""
     blocks = state.blocks
@@ -286,7 +319,7 @@ def _fit_noise(
     unfiltered = noise_powers(blocks)[row, :, 0] @ square
     variance = variance * np.maximum(state.weight[row, :, 0] / unfiltered, 0.1)
     effect_means = np.stack(axis_effects.means, axis=1) if axis_effects.means else None
-    return noise_posterior(fit, blocks, row, variance, chosen, effect_means, state.settings)
+    return noise_posterior(fit, blocks, row, variance, chosen, effect_means, state.settings, wander)
 
 
 def _average_groups(

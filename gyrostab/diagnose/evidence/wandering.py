@@ -60,3 +60,18 @@ def block_mean_variance(step: float, time: Array) -> Array:
     a = step / np.maximum(time, 1e-300)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         return np.where(a > 1e-3, 2.0 * (a + np.expm1(-a)) / a**2, 1.0 - a / 3.0)
+
+
+def allan_variance(tau: float, time: Array) -> Array:
+    """Return the Allan variance at `tau` [s] of unit processes with correlation `time` [s].
+
+    It is the variance of a mean over `tau` less the covariance of two adjacent means. IEEE Std
+    952-1997, annex C, gives the same law.
+
+    Examples
+    --------
+    >>> allan_variance(1.0, np.array([1e-3, 0.5, 1e3])).round(4)
+    array([0.002 , 0.3808, 0.0007])
+    """
+    a = tau / np.maximum(time, 1e-300)
+    return np.asarray(block_mean_variance(tau, time) - (np.expm1(-a) / a) ** 2)

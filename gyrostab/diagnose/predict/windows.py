@@ -17,6 +17,7 @@ from gyrostab.diagnose.predict.candidates import (
     Prospect,
     Variant,
 )
+from gyrostab.diagnose.predict.correlated_powers import with_correlated_powers
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.physics.base import Effect, driver_error
 from gyrostab.physics.prediction import Prediction, Windows
@@ -195,7 +196,7 @@ def rebuild_variant(
     if windows is None:
         windows = make_windows(blocks, driver_names(candidate))
     effect = effects()[candidate.effect].example(**variant.values)
-    prediction = predict_exogenous(effect, windows)
+    prediction = with_correlated_powers(predict_exogenous(effect, windows), blocks)
     built = candidate.statistic.design(
         Prospect(dict(variant.values), prediction, blocks, coefficient)
     )

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.evidence.sample_counts import hidden_by_grid
 from gyrostab.diagnose.predict.candidates import TIME_PARAMETER, Candidate
 from gyrostab.diagnose.predict.channel_use import MIN_BLOCK_SHARE, missing_channel_reason
+from gyrostab.diagnose.predict.correlated_powers import with_correlated_powers
 from gyrostab.diagnose.predict.filter_response import with_band_response
 from gyrostab.diagnose.predict.windows import (
     channel_units,
@@ -159,7 +160,8 @@ def _candidates_of_effect(
     for values in [] if is_missing else list(_nuisance_grid(kind, windows)):
         try:
             effect = kind.example(**values)
-            prediction = with_band_response(predict_exogenous(effect, windows), effect, blocks)
+            in_windows = with_correlated_powers(predict_exogenous(effect, windows), blocks)
+            prediction = with_band_response(in_windows, effect, blocks)
             predictions.append(
                 (
                     values,

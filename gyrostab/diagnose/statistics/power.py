@@ -11,7 +11,7 @@ import xarray as xr
 
 from gyrostab.diagnose.evidence.held_out import LinearModel, noise_columns, with_independent_cells
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
-from gyrostab.diagnose.evidence.wandering import expected_processes
+from gyrostab.diagnose.evidence.wandering import allan_variance, expected_processes
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
 from gyrostab.diagnose.predict.filter_response import undo_filter
 from gyrostab.diagnose.predict.linear_model import (
@@ -350,9 +350,10 @@ def _pad_end(values: Array, size: int) -> Array:
 
 
 def _slow_allan_variance(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -> Array:
-    """Return the Allan variance of B and K by axis [degree2 hour-2], without a ramp."""
+    """Return the Allan variance of B, K and correlated processes by axis [degree2 hour-2]."""
     coefficient = baseline["coefficient"].values
-    total = np.zeros(blocks.sizes["axis"])
+    processes = (expected_processes(baseline, row) for row in range(blocks.sizes["axis"]))
+    total = np.array([part.square @ allan_variance(tau, part.time) for part in processes])
     for place, term in enumerate(baseline["term"].values):
         if str(term) in ("B", "K"):
             total = total + LAWS[str(term)].avar(tau) * np.nan_to_num(coefficient[..., place]) ** 2

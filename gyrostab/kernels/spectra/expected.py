@@ -1,8 +1,9 @@
-"""Expected periodograms of the noise terms in a block, with taper, mean and sampling."""
+"""Expected periodograms of noise in a block, with taper, mean and sampling."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,6 +95,68 @@ def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
     >>> (powers[3] / plain)[:3].round(1)  # no taper: a random walk appears twice
     array([2., 2., 2.])
     """
+    powers = _tapered_powers(
+        sample_covariance(weights.size, rate),
+        weights,
+        ordinates,
+        lambda frequency: _plain_spectra(frequency, rate),
+        rate,
+    )
+    return np.asarray(powers / powers[1])
+
+
+def correlated_powers(weights: Array, rate: float, ordinates: int, time: float) -> Array:
+    """Compute the expected periodogram of an exponentially correlated process.
+
+    Parameters
+    ----------
+    weights, rate, ordinates
+        As in `expected_powers`.
+    time : float
+        Correlation time [s].
+
+    Returns
+    -------
+    ndarray, shape (ordinates,)
+        For unit variance [Hz-1], in the sense of `expected_powers`.
+
+    Examples
+    --------
+    >>> powers = correlated_powers(np.ones(256), 1.0, 100, 1e6)
+    >>> walk = 2e-6 * expected_powers(np.ones(256), 1.0, 100)[3]  # of a variance of 2 s / 1e6 s
+    >>> (powers / walk)[:3].round(3)
+    array([1., 1., 1.])
+    """
+    step = 1.0 / (rate * time)
+    lost = -math.expm1(-step)
+    lag = np.arange(weights.size)
+    covariance = (lost / step) ** 2 * np.exp(-step * np.maximum(lag - 1, 0))
+    covariance[0] = 2.0 * (step - lost) / step**2 if step > 1e-4 else 1.0 - step / 3.0
+    white = np.zeros(weights.size)
+    white[0] = rate
+
+    def plain(frequency: Array) -> Array:
+        bend = 2.0 * np.sin(math.pi * frequency / rate)
+        return np.stack([np.ones_like(frequency), 1.0 / (step**2 + bend**2)])
+
+    of_white, power = _tapered_powers(
+        np.stack([white, covariance]), weights, ordinates, plain, rate
+    )
+    return np.asarray(power / of_white)
+
+
+def _tapered_powers(
+    covariance: Array,
+    weights: Array,
+    ordinates: int,
+    plain: Callable[[Array], Array],
+    rate: float,
+) -> Array:
+    """Compute expected periodograms (row, ordinate) of covariances (row, size), up to a factor.
+
+    Between the ordinates that are computed one by one, the ratio to `plain` spectra (row, ...) is
+    interpolated.
+    """
     size = weights.size
     places = np.unique(
         np.concatenate(
@@ -103,18 +166,15 @@ def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
             ]
         )
     )
-    covariance = sample_covariance(size + 1, rate)
-    wrapped = np.concatenate(
-        [covariance[:, :size], np.zeros((4, 1)), covariance[:, size - 1 : 0 : -1]], axis=1
-    )
+    middle = np.zeros((len(covariance), 1))
+    wrapped = np.concatenate([covariance, middle, covariance[:, :0:-1]], axis=1)
     density = np.fft.fft(wrapped, axis=1).real
     taper, box = np.fft.fft(weights, 2 * size), np.fft.fft(np.ones(size), 2 * size)
-    powers = np.empty((4, places.size))
+    powers = np.empty((len(covariance), places.size))
     for number, k in enumerate(places):
         response = np.roll(taper, 2 * k) - np.conj(taper[2 * k]) * box / size
         powers[:, number] = density @ (response.real**2 + response.imag**2) / (2 * size)
-    powers /= powers[1]
-    ratio = powers / _plain_spectra(places * rate / size, rate)
+    ratio = powers / plain(places * rate / size)
     lines = np.arange(1, ordinates + 1)
     between = np.stack([np.interp(np.log(lines), np.log(places), row) for row in ratio])
-    return np.asarray(between * _plain_spectra(lines * rate / size, rate))
+    return np.asarray(between * plain(lines * rate / size))

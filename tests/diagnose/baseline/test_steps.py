@@ -77,14 +77,6 @@ def test_a_jump_does_not_explain_noise_in_other_blocks(jumped):
     assert any(begin < 1300 and end > 1200 for begin, end in spans)
 
 
-@pytest.mark.slow
-def test_a_telegraph_leaves_no_line_against_its_own_model():
-    hops = {"name": "telegraph", "step": [1.0], "low": 200.0, "high": 200.0}
-    diagnosis = _diagnose_log(_make_log([hops], 7), [hops])
-    assert (diagnosis.verdict, diagnosis.content["mismatches"]) == ("no mismatch", [])
-    assert {effect["name"] for effect in diagnosis.content["baseline"]["expected"]} == {"telegraph"}
-
-
 def test_a_part_of_moving_blocks_has_no_lines(jumped):
     """The log is read again for its lines, without the blocks that are left out."""
     task = Task(jumped, None, None, 5.0, 0, 100, 0.01, no_stage, Settings())

@@ -22,6 +22,7 @@ from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.physics.electronics import GaussMarkov
 from gyrostab.simulate import simulate
 from tests.support.candidates import make_identifications, select_candidate
 
@@ -173,6 +174,23 @@ def test_noise_that_changes_far_from_its_reference_has_the_level_of_the_record()
         squared_noise = level * (1.0 + effect.linear * (degrees - effect.reference))
         assert squared_noise == pytest.approx(0.003**2 * (1.0 + 0.12 * (degrees - 62.0)), rel=0.12)
     assert "at 58 degC" in fit.fitted[0].say()
+
+
+def test_noise_does_not_wander_as_the_effect_does():
+    """The means of an axis contain a wandering bias once: in the effect, not in B and K too."""
+    wander = {"name": "gauss_markov", "rms": 0.3, "correlation_time": 60.0, "axes": ["x"]}
+    blocks = reduce_simulation(wander)
+    baseline = calibrate_noise(blocks)
+    identifications = identify_by_hand(
+        blocks, baseline, "gauss_markov", "power", ("rms",), correlation_time=60.0
+    )
+    (fitted,) = fit_identifications(identifications, baseline)
+    fitted = replace(fitted, effect=GaussMarkov(rms=(0.3,), correlation_time=60.0, axes=("x",)))
+    after = recalibrate(identifications, baseline, [fitted])
+    np.testing.assert_allclose(after["wander_square"].values[:, 0], [0.3**2, 0.0])
+    assert noise_coefficient(baseline, "K")[0] > 1.0
+    assert noise_coefficient(after, "K")[0] < 0.3
+    assert noise_coefficient(after, "B")[0] < 0.05
 
 
 def test_axis_without_an_effect_keeps_its_noise(shaken):

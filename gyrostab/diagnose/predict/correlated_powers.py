@@ -1,0 +1,41 @@
+"""Powers of slow random processes in the bands of a block."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.kernels.spectra.expected import correlated_powers
+from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
+from gyrostab.physics.prediction import Prediction
+
+Array = NDArray[Any]
+
+
+def with_correlated_powers(prediction: Prediction, blocks: xr.Dataset) -> Prediction:
+    """Return a prediction with the powers that blocks show of exponentially correlated processes.
+
+    A block is shorter than the correlation time, so that the steep spectrum leaks into all bands:
+    up to 1.4 times the density of the process. Frequencies of the spectra are equally many in every
+    band.
+    """
+    spectrum = dict(prediction.spectrum)
+    for name, (time, variance) in prediction.wander.items():
+        if name in spectrum and np.isfinite(time):
+            power = _band_powers(blocks, time)
+            per_band = spectrum[name].shape[-1] // power.size
+            spectrum[name] = np.asarray(variance)[:, None] * np.repeat(power, per_band)
+    return replace(prediction, spectrum=spectrum)
+
+
+def _band_powers(blocks: xr.Dataset, time: float) -> Array:
+    """Return the expected power (band,) of a process of unit variance [Hz-1]."""
+    size, rate = int(blocks.attrs["block_samples"]), float(blocks.attrs["sampling_rate_hz"])
+    powers = correlated_powers(taper(size), rate, ordinates(size), time)
+    edges = band_edges(size) - 1
+    return np.array([powers[low:high].mean() for low, high in pairwise(edges)])
