@@ -25,7 +25,6 @@ from gyrostab.kernels.fit.averages import FIT_FIELDS
 from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.limits import cell_limits, chi_square_quantile, estimate_bounds
 from gyrostab.kernels.fit.mixture import Curves
-from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.noise import LAWS, NORMAL_95, TERMS, model_avar
 from gyrostab.schema import OBSERVABLE
 from tests.reference import average_plainly, fit_window_plainly
@@ -492,20 +491,6 @@ def test_many_averaging_times_are_thinned_for_the_fit():
     assert product.sizes["tau"] == 1000
     assert product.edf.notnull().all()
     assert float(product.N.mean()) == pytest.approx(1 / 600, rel=0.05)
-
-
-def test_nonnegative_solution_is_optimal():
-    """Compare with many random feasible points, and with scipy."""
-    from scipy.optimize import nnls
-
-    rng = np.random.default_rng(14)
-    for _ in range(50):
-        design = rng.standard_normal((12, 5)) * 10.0 ** rng.integers(-6, 6, 5)
-        data = rng.standard_normal(12)
-        solution = solve_nonnegative(design.T @ design, design.T @ data)
-        expected, residual = nnls(design, data)
-        assert np.linalg.norm(design @ solution - data) <= residual * (1 + 1e-6)
-        np.testing.assert_allclose(design @ solution, design @ expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(("share", "block"), [(0.0, 1), (0.2, 50), (0.2, 5)])

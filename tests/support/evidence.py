@@ -55,7 +55,7 @@ def power_factors(
     weight = np.asarray(
         baseline["shape_alone"].sel(axis=axis).transpose("block", "band").values, dtype=np.float64
     )
-    level, precision = noise_columns(baseline, axis=axis)
+    level, precision, _ = noise_columns(baseline, axis=axis)
     columns_given = (
         np.empty((*shape, 0))
         if given is None

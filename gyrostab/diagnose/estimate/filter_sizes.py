@@ -181,7 +181,7 @@ def _average_powers(axis: str, state: State) -> tuple[Fit, Array]:
     blocks, row = state.blocks, state.axes.index(axis)
     power, shape = (blocks[name].values[row] for name in ("power", "shape"))
     common, shape_alone = (values[row] for values in common_variance(blocks))
-    effects_of_axis = state.given.get(("power", axis), [])
+    effects_of_axis = state.power_columns(axis)
     columns = [unspread_share(blocks)[row, :, None], state.weight[row], *effects_of_axis]
     averaged = average_blocks(
         power,

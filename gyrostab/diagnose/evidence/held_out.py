@@ -130,11 +130,18 @@ def _factors_by_subset(
     designs: Sequence[NDArray[np.int64]],
     limits: Array,
     log_weight: Array,
+    is_bounded: Sequence[bool] = (),
 ) -> Array:
     """Return the factors of designs from products, whose last columns have this prior precision."""
     out = np.stack(
         [
-            log_evidence(marginalise(part, len(precision), precision), designs, limits, log_weight)
+            log_evidence(
+                marginalise(part, len(precision), precision),
+                designs,
+                limits,
+                log_weight,
+                is_bounded,
+            )
             for part in by_subset
         ]
     )
@@ -142,7 +149,7 @@ def _factors_by_subset(
     return out
 
 
-def noise_columns(baseline: xr.Dataset, *, axis: str) -> tuple[Array, Array]:
+def noise_columns(baseline: xr.Dataset, *, axis: str) -> tuple[Array, Array, Array]:
     """Return the relative change of the spectrum per noise coefficient, and its prior precision.
 
     N may take any value; Q changes by its value and error, B and K by three times that, because the
@@ -155,6 +162,9 @@ def noise_columns(baseline: xr.Dataset, *, axis: str) -> tuple[Array, Array]:
         Per unit of the squared coefficient [1 / unit], for terms with an error.
     precision : ndarray, shape (term, term)
         For changes of the squared coefficients.
+    low : ndarray, shape (term,)
+        Least changes, at which no noise of a term is left; none for N, which may be extrapolated to
+        a temperature far from all of the record.
     """
     spectrum = axis_values(baseline, "spectrum", axis)
     columns = axis_values(baseline, "columns", axis) / spectrum[..., None]
@@ -167,7 +177,8 @@ def noise_columns(baseline: xr.Dataset, *, axis: str) -> tuple[Array, Array]:
         error = np.where(np.array(names) == "Q", np.minimum(error, within), error)
     error = freedom * np.hypot(square, error)
     free = error > 0.0
-    return columns[..., free], np.diag(1.0 / np.square(error[free]))
+    low = np.where(np.array(names) == "N", -np.inf, -square)
+    return columns[..., free], np.diag(1.0 / np.square(error[free])), low[free]
 
 
 class LinearModel(NamedTuple):
@@ -180,6 +191,8 @@ class LinearModel(NamedTuple):
     #: (column, column): for the given columns; negative on the diagonal for a nearly free column,
     #: whose precision is taken from the data.
     precision: Array
+    is_bounded: Sequence[bool] = ()  # for each design, whether its sizes cannot be negative
+    low: Array = np.empty(0)  # (column,): least sizes of the given columns
 
     def usable_weight(self) -> Array:
         """Return the weight, 0 where it is unknown or a record has no value."""
@@ -197,7 +210,7 @@ def with_independent_cells(
         remove_common_part(np.where(present & np.isfinite(array), array, 0.0), weight, common, unit)
         for array in (model.values, model.given, *model.designs)
     )
-    return LinearModel(values, weight, designs, given, model.precision)
+    return model._replace(values=values, weight=weight, designs=designs, given=given)
 
 
 def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
@@ -228,7 +241,9 @@ def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
             of_fold = zip(products, classes[:, length] == number, strict=True)
             held = _sum_products([part for part, is_held in of_fold if is_held])
             subset_products.append(Products(*(a - b for a, b in zip(total, held, strict=True))))
-    return _factors_by_subset(subset_products, precision, numbers, limits, np.zeros(1))
+    return _factors_by_subset(
+        subset_products, precision, numbers, limits, np.zeros(1), model.is_bounded
+    )
 
 
 def _sum_products(products: Sequence[Products]) -> Products:

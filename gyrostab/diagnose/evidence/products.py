@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.special import log_ndtr
 
 from gyrostab.diagnose.evidence.folds import FOLDS
 from gyrostab.diagnose.evidence.wandering import RandomProcesses, expected_processes
@@ -206,7 +207,11 @@ def remove_common_part(
 
 
 def log_evidence(
-    products: Products, designs: Sequence[NDArray[np.int64]], limits: Array, log_weight: Array
+    products: Products,
+    designs: Sequence[NDArray[np.int64]],
+    limits: Array,
+    log_weight: Array,
+    is_bounded: Sequence[bool] = (),
 ) -> Array:
     """Compute the log marginal likelihood without any design, and with each, (1 + design, record).
 
@@ -218,7 +223,10 @@ def log_evidence(
         Error of every factor in white noise; 0 for columns without effect.
     log_weight : ndarray, shape (grid,)
         Logarithm of the weight of every grid point; not normalised.
+    is_bounded : sequence of bool, shape (design,), optional
+        Whether the factors of a design cannot be negative; none by default.
     """
+    bounded = np.array(is_bounded, np.bool_) if len(is_bounded) else np.zeros(len(designs), bool)
     weight = log_weight - np.logaddexp.reduce(log_weight)
     base = np.ascontiguousarray(
         (weight[:, None] - 0.5 * (products.square + products.log_determinant[:, None])).T
@@ -226,18 +234,23 @@ def log_evidence(
     out = np.empty((1 + len(designs), base.shape[0]))
     out[0] = np.logaddexp.reduce(base, axis=1)
     at_once = max(1, _MAX_PRODUCTS_AT_ONCE // max(base.size, 1))
-    for width in sorted({chosen.size for chosen in designs}):
-        same_width = [number for number, chosen in enumerate(designs) if chosen.size == width]
-        for first in range(0, len(same_width), at_once):
-            batch = same_width[first : first + at_once]
+    widths = np.array([chosen.size for chosen in designs], np.int64)
+    for width, bound in sorted({*zip(widths.tolist(), bounded.tolist(), strict=True)}):
+        same_kind = np.flatnonzero((widths == width) & (bounded == bound)).tolist()
+        for first in range(0, len(same_kind), at_once):
+            batch = same_kind[first : first + at_once]
             out[1 + np.array(batch)] = _equal_width_evidence(
-                products, np.stack([designs[number] for number in batch]), limits, base
+                products, np.stack([designs[number] for number in batch]), limits, base, bound
             )
     return out
 
 
 def _equal_width_evidence(
-    products: Products, chosen: NDArray[np.int64], limits: Array, base: Array
+    products: Products,
+    chosen: NDArray[np.int64],
+    limits: Array,
+    base: Array,
+    is_bounded: bool,
 ) -> Array:
     """Compute log marginal likelihoods (design, record) of equal-width designs (design, column)."""
     scale = limits[chosen]
@@ -246,14 +259,47 @@ def _equal_width_evidence(
     )
     rotated = products.cross[:, chosen] * scale[..., None]
     if chosen.shape[1] == 1:
-        eigenvalues = gram[..., 0]
+        eigenvalues, vectors = gram[..., 0], np.ones_like(gram)
     else:
         eigenvalues, vectors = np.linalg.eigh(gram)
         rotated = vectors.swapaxes(2, 3) @ rotated
-    squares = np.ascontiguousarray(np.maximum(eigenvalues, 0.0).swapaxes(0, 1))
+    squares = np.maximum(eigenvalues, 0.0)
+    if is_bounded:
+        return _bounded_evidence(base, rotated, squares, vectors)
     return mixed_evidence(
-        base, np.ascontiguousarray(rotated.transpose(1, 3, 0, 2)), squares, np.square(WIDTHS)
+        base,
+        np.ascontiguousarray(rotated.transpose(1, 3, 0, 2)),
+        np.ascontiguousarray(squares.swapaxes(0, 1)),
+        np.square(WIDTHS),
     )
+
+
+def _bounded_evidence(base: Array, rotated: Array, eigenvalues: Array, vectors: Array) -> Array:
+    """Compute the log marginal likelihoods (design, record) of factors that cannot be negative.
+
+    Their prior is the positive half of the normal one. The likelihood changes by the share of the
+    posterior that is positive over that of the prior, each as if the factors were independent.
+
+    Parameters
+    ----------
+    base : ndarray, shape (record, grid)
+    rotated : ndarray, shape (grid, design, column, record)
+        ``x' y`` in the frame of the eigenvectors of ``x' x``.
+    eigenvalues, vectors : ndarray, shape (grid, design, column) and (grid, design, column, column)
+    """
+    width = np.square(WIDTHS)[:, None, None, None]
+    spread = 1.0 + width * eigenvalues
+    variance = width / spread  # (width, grid, design, column) of the posterior
+    mean = vectors @ (variance[..., None] * rotated)
+    sd = np.sqrt(np.einsum("gdij,wgdj->wgdi", np.square(vectors), variance))
+    terms = (
+        base.T[:, None]
+        - 0.5 * np.log(spread).sum(axis=3)[..., None]
+        + 0.5 * (variance[..., None] * rotated**2).sum(axis=3)
+        + (log_ndtr(mean / sd[..., None]) + np.log(2.0)).sum(axis=3)
+    )
+    joined = terms.reshape(-1, *terms.shape[2:])
+    return np.asarray(np.logaddexp.reduce(joined, axis=0) - np.log(len(WIDTHS)))
 
 
 def held_out_evidence(

@@ -154,7 +154,7 @@ def _is_possible(component: Component, state: State) -> bool:
     return (
         not is_too_large
         and _is_in_range(component, state)
-        and not (is_added and component_size(component, state)[0] <= 0.0)
+        and not (is_added and (component_mixture(component, state).mean <= 0.0).any())
     )
 
 

@@ -15,6 +15,7 @@ from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State, pair_rows, select_row
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.kernels.regression.nonnegative import solve_bounded
 
 Array = NDArray[np.float64]
 #: Least fitted power over the expected one. Design choice.
@@ -71,7 +72,7 @@ def refit_weights(state: State) -> State:
     """Set the weights by a fit of all given power columns (Fisher scoring, gamma likelihood)."""
     weight = state.weight.copy()
     for row, axis in enumerate(state.axes):
-        if state.given.get(("power", axis)):
+        if state.power_columns(axis):
             weight[row] = fit_powers(state, axis)
     return replace(
         state, weight=weight, blocks=drop_changed_tails(state.blocks, weight, state.settings)
@@ -82,15 +83,16 @@ def fit_powers(state: State, axis: str, left_out: NDArray[np.bool_] | None = Non
     """Fit the powers of an axis, (block, band), and leave some of its power columns out of them."""
     row, shape = state.axes.index(axis), state.weight.shape[1:]
     expected = axis_values(state.baseline, "spectrum", axis)
-    level, precision = noise_columns(state.baseline, axis=axis)
+    level, precision, low = noise_columns(state.baseline, axis=axis)
     level_count = level.shape[2]
-    given = [np.broadcast_to(column, shape) for column in state.given[("power", axis)]]
+    given = [np.broadcast_to(column, shape) for column in state.power_columns(axis)]
     columns = np.concatenate([level * expected[..., None], np.stack(given, axis=-1)], axis=-1)
     prior = np.zeros(columns.shape[2])
     prior[:level_count] = np.diagonal(precision)
+    least = np.array([*low, *state.least_powers(axis)])
     power, degrees = (state.blocks[name].values[row] for name in ("power", "shape"))
     degrees = np.where(state.masked[row][:, None], np.nan, degrees)
-    inputs = expected, columns, prior, power, degrees
+    inputs = expected, columns, prior, least, power, degrees
     sizes = state.recall(partial(_fit_sizes, *inputs), b"powers", *inputs)
     if left_out is not None:
         sizes = np.where(np.append(np.zeros(level_count, np.bool_), left_out), 0.0, sizes)
@@ -129,8 +131,18 @@ def drop_changed_tails(
 _ROUNDS = 4  # steps of Fisher scoring
 
 
-def _fit_sizes(expected: Array, columns: Array, prior: Array, power: Array, shape: Array) -> Array:
-    """Fit the sizes of columns (block, band, column) to powers with gamma distributions."""
+def _fit_sizes(
+    expected: Array,
+    columns: Array,
+    prior: Array,
+    low: Array,
+    power: Array,
+    shape: Array,
+) -> Array:
+    """Fit the sizes of columns (block, band, column) to powers with gamma distributions.
+
+    The sizes are at least `low`.
+    """
     flat, power, shape = expected.ravel(), power.ravel(), shape.ravel()
     columns = columns.reshape(flat.size, -1)
     size = np.maximum(np.abs(columns).max(axis=0), 1e-300)
@@ -142,6 +154,7 @@ def _fit_sizes(expected: Array, columns: Array, prior: Array, power: Array, shap
         w = np.where(np.isfinite(w), w, 0.0)
         normal = (columns * w[:, None]).T @ columns + np.diag(prior / size**2)
         normal += 1e-9 * np.diag(np.maximum(np.diagonal(normal), 1e-300))
-        sizes = np.linalg.solve(normal, columns.T @ (w * np.where(good, power - flat, 0.0)))
+        right = columns.T @ (w * np.where(good, power - flat, 0.0))
+        sizes = solve_bounded(normal, right, low * size)
         fitted = np.maximum(flat + columns @ sizes, MIN_POWER_RATIO * flat)
     return np.asarray(sizes / size)

@@ -35,7 +35,8 @@ class State:
     weight: Array
     masked: NDArray[np.bool_]  # (axis, block): blocks whose powers and cross-spectra are left out
     #: (statistic, row) -> columns in the model with and without a candidate; the row is an axis, or
-    #: the two axes of a pair with a comma between them.
+    #: the two axes of a pair with a comma between them. Powers that effects add, whose sizes cannot
+    #: be negative, are under "added_power", all others under "power".
     given: dict[tuple[str, str], list[Array]] = field(default_factory=dict)
     settings: Settings = DEFAULTS
     #: What was computed for the record, in any of its states, by the digest of the inputs.
@@ -62,6 +63,17 @@ class State:
         given = dict(self.given)
         given[statistic, row] = [*given.get((statistic, row), []), *columns]
         return replace(self, given=given)
+
+    def power_columns(self, axis: str) -> list[Array]:
+        """Return the given columns of the powers of an axis, those that effects add last."""
+        return [*self.given.get(("power", axis), []), *self.given.get(("added_power", axis), [])]
+
+    def least_powers(self, axis: str) -> list[float]:
+        """Return the least sizes of these columns."""
+        any_count, added_count = (
+            len(self.given.get((name, axis), [])) for name in ("power", "added_power")
+        )
+        return [-np.inf] * any_count + [0.0] * added_count
 
     @property
     def axes(self) -> list[str]:
@@ -172,10 +184,13 @@ def linear_model(
     *,
     known: Sequence[Array] = (),
     precision: Any = (),
+    is_bounded: Sequence[bool] = (),
+    low: Sequence[float] = (),
 ) -> LinearModel:
     """Return a linear model of cells (block, cell) from columns of any shape that suits them.
 
-    The given columns are known ones with a prior precision, and nearly free ones of named effects.
+    The given columns are known ones with a prior precision, and nearly free ones of named effects;
+    `low` are their least sizes, if any. The sizes of designs cannot be negative where `is_bounded`.
     """
     return LinearModel(
         values,
@@ -183,6 +198,8 @@ def linear_model(
         [stack_columns(design, weight.shape) for design in designs],
         stack_columns([*known, *given], weight.shape),
         np.diag([*precision, *[-1.0] * len(given)]),
+        is_bounded,
+        np.array(low) if len(low) else np.full(len(known) + len(given), -np.inf),
     )
 
 

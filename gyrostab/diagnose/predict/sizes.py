@@ -13,6 +13,7 @@ from gyrostab.diagnose.evidence.mixture import Mixture, products_mixture
 from gyrostab.diagnose.evidence.products import axis_noise, mean_products
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.kernels.regression.nonnegative import solve_bounded
 
 Array = NDArray[np.float64]
 _RIDGE = 1e-12  # of the trace of the Gram matrix, against singular columns
@@ -82,7 +83,10 @@ def component_mixture(
 
 
 def linear_mixture(component: Component, state: State, variant: Variant) -> Mixture:
-    """Compute the sizes of columns in the linear model of a statistic, as one point."""
+    """Compute the sizes of columns in the linear model of a statistic, as one point.
+
+    Powers that effects add cannot be negative, nor can what is left of the noise.
+    """
     candidate = replace(component.candidate, variants=(variant,))
     row = candidate.statistic.rows(candidate, state).index(component.row)
     model = candidate.statistic.model([candidate], row, state.blocks, state)
@@ -105,14 +109,35 @@ def linear_mixture(component: Component, state: State, variant: Variant) -> Mixt
     )
     normal = (columns * weight[:, None]).T @ columns + np.diag(prior + 1e-9)
     projected = columns.T @ (weight * values)
-    covariance = np.linalg.inv(normal)
-    mean = covariance @ projected
-    log_weight = 0.5 * mean @ projected - 0.5 * np.linalg.slogdet(normal)[1]
+    least = 0.0 if variant.squared and component.statistic.is_power else -np.inf
+    low = np.concatenate([np.full(own_count, least), model.low]) * size
+    best = solve_bounded(normal, projected, low)
+    log_likelihood = best @ projected - 0.5 * best @ normal @ best
+    log_weight = log_likelihood - 0.5 * np.linalg.slogdet(normal)[1]
+    mean, covariance = _own_sizes(normal, projected, low, own_count)
     scale = size[:own_count]
     # A column that is 0 everywhere has an infinite variance.
     with np.errstate(over="ignore"):
-        own_covariance = covariance[:own_count, :own_count] / np.outer(scale, scale)
-    return Mixture(np.array([log_weight]), (mean[:own_count] / scale)[None], own_covariance[None])
+        own_covariance = covariance / np.outer(scale, scale)
+    return Mixture(np.array([log_weight]), (mean / scale)[None], own_covariance[None])
+
+
+def _own_sizes(normal: Array, projected: Array, low: Array, own_count: int) -> tuple[Array, Array]:
+    """Return the first sizes and their covariance, from the normal equations of all.
+
+    Each of them may be any number, so that its error tells how far from its bound it is, while all
+    others are at their bounds or above.
+    """
+    mean, covariance = np.empty(own_count), np.zeros((own_count, own_count))
+    for own in range(own_count):
+        others = np.where(np.arange(low.size) == own, -np.inf, low)
+        sizes = solve_bounded(normal, projected, others)
+        used = np.flatnonzero(sizes > others)
+        row = np.linalg.inv(normal[np.ix_(used, used)])[np.searchsorted(used, own)]
+        mean[own] = sizes[own]
+        is_own = used < own_count
+        covariance[own, used[is_own]] = row[is_own]
+    return mean, 0.5 * (covariance + covariance.T)
 
 
 def disagreement_nats(size: Array, weight: Array) -> float:

@@ -293,7 +293,7 @@ class Statistic:
                 size: tuple[float, ...] = (value, sd, *ends[:, number].tolist())
                 likeliest = float(best[number])
                 if component.variant.squared:
-                    size = _square_root(value, sd)
+                    size = (*_square_root(value, sd), *np.sqrt(np.maximum(ends[:, number], 0.0)))
                     likeliest = float(np.sqrt(max(likeliest, 0.0)))
                 key = name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"
                 out[key], fit.likeliest[key] = size, likeliest

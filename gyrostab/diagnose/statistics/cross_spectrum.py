@@ -181,9 +181,9 @@ class CrossSpectrum(Statistic):
         ]
         for axis in component.row if added else ():
             powers = [power_column(density, state.axes.index(axis), state) for density in added]
-            known = state.given.get(("power", axis), [])
+            known = state.power_columns(axis)
             new = [power for power in powers if not any(np.array_equal(power, k) for k in known)]
-            state = state.with_columns("power", axis, new)
+            state = state.with_columns("added_power", axis, new)
         return state
 
     def has_power_of_effect(self, component: Component, state: State) -> bool:

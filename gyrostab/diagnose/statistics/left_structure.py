@@ -113,7 +113,7 @@ def _power_levels(state: State, row: int, axis: str) -> tuple[Array, Array, Arra
         variance = 1.0 / total + axis_values(state.baseline, "common", axis)
         named = [
             (use * column / state.weight[row]).sum(axis=1) / total
-            for column in state.given.get(("power", axis), [])
+            for column in state.power_columns(axis)
         ]
     columns = np.nan_to_num(np.stack(named, axis=-1)) if named else np.empty((total.size, 0))
     largest = np.abs(columns).max(axis=0, initial=1e-300)

@@ -171,7 +171,7 @@ class Power(Statistic):
         values = records_last(data["power"].values, 3)[row] - expected[..., None]
         weight = axis_values(state.baseline, "shape_alone", axis) / state.weight[row] ** 2
         weight = np.where(state.masked[row][:, None], 0.0, weight)
-        level, precision = noise_columns(state.baseline, axis=axis)
+        level, precision, low = noise_columns(state.baseline, axis=axis)
         unspread, width = unspread_share(state.blocks)[row], band_widths(state.blocks)
         model = linear_model(
             values,
@@ -180,9 +180,13 @@ class Power(Statistic):
                 candidates,
                 lambda density: mix_with_mean(select_row(density, row), unspread, width),
             ),
-            state.given.get(("power", axis), []),
+            state.power_columns(axis),
             known=[level[..., number] * expected for number in range(level.shape[2])],
             precision=np.diagonal(precision),
+            is_bounded=[
+                variant.squared for candidate in candidates for variant in candidate.variants
+            ],
+            low=[*low, *state.least_powers(axis)],
         )
         common = axis_values(state.baseline, "common", axis)
         return with_independent_cells(model, common, state.weight[row])
@@ -205,7 +209,7 @@ class Power(Statistic):
         ):
             return state  # the noise of the baseline is filtered already
         return state.with_columns(
-            "power",
+            "added_power" if component.variant.squared else "power",
             axis,
             [power_column(density, row, state) for density in component.variant.design],
         )

@@ -137,7 +137,7 @@ class SpectralLine(Statistic):
         frequency = float(state.blocks["line_frequency"].values[component.place])
         axis = component.row[0]
         density = bands_at(state, np.asarray(frequency)).astype(float)
-        power_columns = state.given.get(("power", axis), [])
+        power_columns = state.power_columns(axis)
         for band in np.flatnonzero(density.any(axis=0)):
             column = np.zeros_like(density)
             column[:, band] = 1.0

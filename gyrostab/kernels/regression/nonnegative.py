@@ -1,18 +1,21 @@
-"""Non-negative least squares.
-
-The solution is exact: of five terms there are at most 31 subsets, and all are tried.
-"""
+"""Least squares with sizes that cannot be negative: all of a few, or some of many."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 Array = NDArray[np.float64]
+#: Share of the square of a column that free ones leave, below which it counts as one of them. Above
+#: rounding errors.
+_MIN_APART = 1e-8
 
 
 def solve_nonnegative(normal: Array, right: Array) -> Array:
     """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0``.
+
+    The solution is exact: of five terms there are at most 31 subsets, and all are tried.
 
     Parameters
     ----------
@@ -40,4 +43,50 @@ def solve_nonnegative(normal: Array, right: Array) -> Array:
     trials = np.linalg.solve(systems, (members * scaled_right)[..., None])[..., 0]
     gains = np.where((trials >= 0.0).all(axis=1), trials @ scaled_right, -np.inf)
     solution[used] = np.abs(trials[gains.argmax()]) * scale  # without a negative zero
+    return solution
+
+
+def solve_bounded(normal: Array, right: Array, low: Array) -> Array:
+    """Minimise ``s^T normal s - 2 right^T s`` over ``s >= low``.
+
+    Parameters
+    ----------
+    normal, right : ndarray (n, n), (n,)
+        Normal equations; `normal` is positive definite.
+    low : ndarray (n,)
+        Least sizes; ``-inf`` where there is none.
+
+    Returns
+    -------
+    ndarray (n,)
+
+    Examples
+    --------
+    >>> normal, right = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0])
+    >>> solve_bounded(normal, right, np.array([0.0, -np.inf])).round(9)
+    array([ 1., -1.])
+    >>> solve_bounded(normal, right, np.array([-np.inf, -0.5])).round(9)
+    array([ 0.75, -0.5 ])
+    """
+    solution = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
+    if (solution >= low).all():
+        return solution
+    is_bounded = np.isfinite(low)
+    free = ~is_bounded
+    scale = 1.0 / np.sqrt(np.diagonal(normal))
+    scaled = normal * np.outer(scale, scale)
+    least = low[is_bounded] / scale[is_bounded]
+    across = scaled[np.ix_(free, is_bounded)]
+    sides = np.column_stack([across, (scale * right)[free]])
+    from_bounded, from_data = np.split(np.linalg.solve(scaled[np.ix_(free, free)], sides), [-1], 1)
+    bounded = scaled[np.ix_(is_bounded, is_bounded)] - across.T @ from_bounded
+    above = (scale * right)[is_bounded] - across.T @ from_data[:, 0] - bounded @ least
+    # what the free sizes do as well stays at its bound
+    is_apart = np.diagonal(bounded) > _MIN_APART
+    eigenvalues, vectors = np.linalg.eigh(bounded[np.ix_(is_apart, is_apart)])
+    root = np.sqrt(np.maximum(eigenvalues, np.finfo(float).eps))
+    sizes = least
+    sizes[is_apart] += nnls(root[:, None] * vectors.T, vectors.T @ above[is_apart] / root)[0]
+    solution[is_bounded] = scale[is_bounded] * sizes
+    solution[free] = scale[free] * (from_data[:, 0] - from_bounded @ sizes)
     return solution

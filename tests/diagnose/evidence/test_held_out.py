@@ -198,7 +198,7 @@ def test_factors_of_powers_are_those_of_dense_marginal_likelihoods(is_known):
         rng.standard_normal((n, bands, 2)),
     ]
     factors = power_factors(data, baseline, designs, axis="x")
-    level, precision = noise_columns(baseline, axis="x")
+    level, precision, _ = noise_columns(baseline, axis="x")
     weight = data["shape"].values[0].ravel()
     cells = np.isfinite(weight)
     Z = level.reshape(-1, precision.shape[0])

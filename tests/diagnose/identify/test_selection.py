@@ -111,8 +111,10 @@ def test_chance_on_another_axis_does_not_veto_an_effect(shaken, monkeypatch):
     size_by_axis = {"x": 1.0, "y": -0.1, "z": 0.1}
     monkeypatch.setattr(
         identifiability,
-        "component_size",
-        lambda component, state: (size_by_axis[component.row[0]], 0.01),
+        "component_mixture",
+        lambda component, state: Mixture(
+            np.zeros(1), np.full((1, 1), size_by_axis[component.row[0]]), np.full((1, 1, 1), 1e-4)
+        ),
     )
     assert keep_physical([component, *elsewhere], state)[0] == [component, elsewhere[1]]
 
