@@ -19,6 +19,7 @@ from gyrostab.diagnose.reduce.moving_blocks import (
 )
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 
 Array = NDArray[np.float64]
 
@@ -32,7 +33,7 @@ def unexplained_motion(
     sample by sample, in the power. It is not enough that it adds evidence: a step or a drifting
     channel also explains a part of an intermittent rotation. Two levels, or several steps, have
     their course from the means themselves, hence no error of form: they must leave the axis at
-    rest.
+    rest. So must the blocks without anomalous samples.
 
     Parameters
     ----------
@@ -51,6 +52,8 @@ def unexplained_motion(
         for axis in component.row
     }
     moving = moving_blocks(blocks, settings=settings)
+    usual_blocks = mask_anomalous_blocks(blocks, components, settings)
+    moving_as_usual = moving_blocks(usual_blocks, settings=settings)
     span = sample_range(blocks)
     for row, axis in enumerate(map(str, blocks["axis"].values)):
         axis_components = [
@@ -63,7 +66,11 @@ def unexplained_motion(
             for component in axis_components
             for column in mean_columns(component.variant, row)
         ]
-        has_cause = axis in explained_axes or _explains_power(components, axis, moving[row], state)
+        has_cause = (
+            axis in explained_axes
+            or not moving_as_usual[row].any()
+            or _explains_power(components, axis, moving[row], state)
+        )
         if has_cause or (
             columns
             and _is_explained(

@@ -55,7 +55,7 @@ _SAMPLES = {
     "kurtosis": "a sample distribution that is not normal",
     "lattice": "values on a coarse quantization grid",
 }
-_FAR_SAMPLES = ("outliers", "stuck", "filled")  # anomalous samples that move the means
+_NEAR_ZERO = ("stuck", "filled")  # anomalous samples that differ from a rate far from zero
 _MAX_BLOCK_SIGMA = 4.0  # of the kurtosis of one block: the counts judge single outliers
 #: Least scatter of the scores: if null records never have one, a single one is not a mismatch.
 _MIN_SCATTER = (0.35, 0.35, 0.35, 0.35, 0.2)
@@ -168,8 +168,8 @@ class SampleCounts(Statistic):
         return replace(state, blocks=blocks)
 
     def moves_means(self, component: Component) -> bool:
-        """Return whether samples are far from the rate, or zero."""
-        return component.variant.columns[0] in _FAR_SAMPLES
+        """Return whether samples are zero; outliers move only the means of their own blocks."""
+        return component.variant.columns[0] in _NEAR_ZERO
 
     def has_power_of_effect(self, component: Component, state: State) -> bool:
         """Return whether no block is left out: with the blocks their power may be left out too."""

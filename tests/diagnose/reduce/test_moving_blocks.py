@@ -128,7 +128,7 @@ def identification(
     design = np.empty(0) if course is None else course[None, None]
     variant, candidate = (
         SimpleNamespace(columns=(column,), design=design),
-        SimpleNamespace(statistic=find_statistic(statistic), reference=()),
+        SimpleNamespace(effect=effect, statistic=find_statistic(statistic), reference=()),
     )
     return SimpleNamespace(
         effect=effect,
@@ -153,7 +153,7 @@ def test_effect_explains_motion_if_it_leaves_almost_nothing(reduced, state):
     ).any()
     for other in (
         identification("rotation_line", "rotation_order", "z"),
-        identification("spikes", "sample_counts", "z", column="outliers"),
+        identification("dead_zone", "sample_counts", "z", column="stuck"),
     ):
         assert not unexplained_motion(whole, [other], state).any()
     step = np.where(np.arange(bump.size) < np.flatnonzero(moving[2]).mean(), 0.0, 1.0)
@@ -165,6 +165,17 @@ def test_effect_explains_motion_if_it_leaves_almost_nothing(reduced, state):
         identification("held_samples", "sample_counts", "z", column="repeats"),
     ):
         np.testing.assert_array_equal(unexplained_motion(whole, [other], state), moving)
+
+
+def test_outliers_explain_motion_in_their_blocks_only(reduced, state):
+    whole, _ = reduced
+    moving = moving_blocks(whole)
+    spikes = identification("spikes", "sample_counts", "z", column="outliers")
+    for in_blocks in (moving[2], moving[2] & (np.arange(moving.shape[1]) % 2 == 0)):
+        counts = whole["outliers"].copy()
+        counts[2] = np.where(in_blocks, 5, 0)
+        left = unexplained_motion(whole.assign(outliers=counts), [spikes], state)
+        np.testing.assert_array_equal(left, moving & (in_blocks != moving[2]).any())
 
 
 def test_several_steps_do_not_explain_a_slow_motion(reduced, state):
