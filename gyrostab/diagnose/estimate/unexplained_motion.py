@@ -33,7 +33,7 @@ def unexplained_motion(
     sample by sample, in the power. It is not enough that it adds evidence: a step or a drifting
     channel also explains a part of an intermittent rotation. Two levels, or several steps, have
     their course from the means themselves, hence no error of form: they must leave the axis at
-    rest. So must the blocks without anomalous samples.
+    rest. Outliers explain the blocks in which they are.
 
     Parameters
     ----------

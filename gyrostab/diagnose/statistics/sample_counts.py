@@ -168,7 +168,7 @@ class SampleCounts(Statistic):
         return replace(state, blocks=blocks)
 
     def moves_means(self, component: Component) -> bool:
-        """Return whether samples are zero; outliers move only the means of their own blocks."""
+        """Return whether samples are zero; outliers move only the means of blocks with outliers."""
         return component.variant.columns[0] in _NEAR_ZERO
 
     def has_power_of_effect(self, component: Component, state: State) -> bool:
