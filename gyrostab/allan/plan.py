@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -16,6 +16,7 @@ from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.schema import signal_name
 from gyrostab.time.durations import averaging_factors, samples
 
+Data = TypeVar("Data", xr.Dataset, xr.DataArray)
 #: Largest number of cells (windows times averaging times) of a unit of work, and of a part of a
 #: surface over all axes.
 MOST_CELLS = 2**20
@@ -57,7 +58,7 @@ def make_plan(
         if not (isinstance(share, int | float) and 0.0 <= share <= most):
             raise OptionError(f"{option}={share!r}: give a share from 0 to 1")
     name = signal_name(log)
-    signal = log[name] if axis is None else _select_axes(log[name], axis)
+    signal = log[name] if axis is None else select_axes(log[name], axis)
     rate = float(log.attrs["sampling_rate_hz"])
     intervals = signal.sizes["time"] - (1 if name == "angle" else 0)
     length, hop = _window_and_step(
@@ -119,14 +120,15 @@ def choose_window(log: xr.Dataset) -> str:
     return f"{seconds}s" if seconds < 60 else f"{seconds // 60}min"
 
 
-def _select_axes(signal: xr.DataArray, axis: str | Sequence[str]) -> xr.DataArray:
+def select_axes(log: Data, axis: str | Sequence[str]) -> Data:
+    """Return a log, or its signal, with these axes only."""
     axes = [axis] if isinstance(axis, str) or not np.iterable(axis) else list(dict.fromkeys(axis))
-    available = [str(name) for name in signal["axis"].values]
+    available = [str(name) for name in log["axis"].values]
     unknown = [name for name in axes if name not in available]
     if unknown or not axes:
         quoted = ", ".join(map(repr, unknown)) or "''"
         raise OptionError(f"axis {quoted} is not in the log; it has {', '.join(available)}")
-    return signal.sel(axis=axes)
+    return log.sel(axis=axes)
 
 
 def _check_size(available: int) -> None:

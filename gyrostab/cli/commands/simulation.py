@@ -87,6 +87,7 @@ def diagnose(
     simulation: Annotated[Path | None, Parameter(metavar="MODEL.toml|SIM.nc")] = None,
     quiet: Annotated[list[str] | None, Parameter(metavar="START/END", negative=())] = None,
     block: Annotated[str | None, Parameter(metavar="DURATION")] = None,
+    axis: Annotated[list[str] | None, Parameter(metavar="NAME", negative=())] = None,
     level: Annotated[float, Parameter(validator=Number(gt=0, lt=0.5))] = 0.01,
     nulls: Annotated[int, whole_number(100)] = 400,
     seed: Annotated[int, whole_number(0)] = 0,
@@ -119,6 +120,9 @@ def diagnose(
     block
         Length of the blocks in which statistics are computed (default: 20s, less in short
         records, more in records above 5.6h).
+    axis
+        Diagnose this gyro axis only: x. Repeat for more. Effects that axes have in common need
+        several.
     level
         False-alarm probability: how often anything is reported for a recording of noise alone.
     nulls
@@ -126,6 +130,9 @@ def diagnose(
     seed
         Seed of the null records.
     """
+    import xarray as xr
+
+    from gyrostab.allan.plan import select_axes
     from gyrostab.diagnose.core import diagnose as run_diagnosis
     from gyrostab.diagnose.inputs import parse_quiescent_span
     from gyrostab.jobs.run import load_log
@@ -142,6 +149,9 @@ def diagnose(
             if simulation and simulation.suffix.lower() != ".toml"
             else simulation
         )
+        if axis:
+            log = select_axes(log, axis)
+            expected = select_axes(expected, axis) if isinstance(expected, xr.Dataset) else expected
         diagnosis = run_diagnosis(
             log,
             simulation=expected,
