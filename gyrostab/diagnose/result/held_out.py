@@ -14,7 +14,7 @@ from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks
 from gyrostab.diagnose.evidence.held_out import mean_residual, noise_weight
 from gyrostab.diagnose.evidence.products import axis_noise, mean_products
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
-from gyrostab.diagnose.statistics.power import allan_surface
+from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score
 from gyrostab.noise import NORMAL_95
 

@@ -9,8 +9,8 @@ import xarray as xr
 from scipy.special import gammaincinv
 
 from gyrostab.diagnose.reduce.schema import Variable, label_variables
+from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.mean import window_means
-from gyrostab.diagnose.statistics.power import allan_surface
 from gyrostab.diagnose.statistics.scores import Array, Windows, sum_over_windows
 
 #: The three cases side by side: the simulation without and with the effects.

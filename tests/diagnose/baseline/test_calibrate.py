@@ -18,7 +18,7 @@ from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
 from gyrostab.diagnose.baseline.quiescent import find_quiescent_blocks
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.statistics.power import allan_surface
+from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.scores import cube_root_score
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.spectra.expected import expected_powers, sample_covariance

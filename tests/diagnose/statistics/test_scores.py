@@ -12,9 +12,9 @@ from scipy import stats
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.nulls.scores import null_scores, standardise
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics import allan_surface as davar
 from gyrostab.diagnose.statistics import cross_spectrum as cross_axis
 from gyrostab.diagnose.statistics import find_statistic, mean
-from gyrostab.diagnose.statistics import power as davar
 from gyrostab.diagnose.statistics.restart import _restart_blocks
 from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
