@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from gyrostab.kernels.spectra.expected import interval_variance
 from gyrostab.physics.base import Array, Chunk, Windows
 
 #: Degrees in a turn.
@@ -182,7 +183,7 @@ def lorentz_density(frequency: Array, correlation_time: float, rate: float) -> A
     """
     x = 1.0 / (rate * correlation_time)
     lost = -math.expm1(-x)
-    at_once = 2.0 * (x - lost) / x**2 if x > 1e-4 else 1.0 - x / 3.0
+    at_once = float(interval_variance(np.array(x)))
     turn = np.exp(-2j * np.pi * np.asarray(frequency, np.float64) / rate)
     return np.asarray(
         (at_once + 2.0 * (lost / x) ** 2 * (turn / (1.0 - math.exp(-x) * turn)).real) / rate

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.linear_model import spread_by_gaps
+from gyrostab.diagnose.predict.linear_model import average_in_bands, spread_by_gaps
 from gyrostab.kernels.spectra.expected import expected_powers
-from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
+from gyrostab.kernels.spectra.periodogram import ordinates, taper
 from gyrostab.noise import LAWS
 
 Array = NDArray[np.float64]
@@ -33,9 +32,7 @@ def line_columns(blocks: xr.Dataset) -> Array:
 
 def band_columns(blocks: xr.Dataset) -> Array:
     """Return the means (band, term) of `line_columns` over the bands."""
-    columns = line_columns(blocks)
-    edges = band_edges(int(blocks.attrs["block_samples"])) - 1
-    return np.stack([columns[low:high].mean(axis=0) for low, high in pairwise(edges)])
+    return average_in_bands(line_columns(blocks).T, blocks).T
 
 
 def noise_powers(blocks: xr.Dataset, response: Array | None = None) -> Array:

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.calibrate import assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, common_variance, line_columns
 from gyrostab.diagnose.baseline.known_effects import expect_known_effects
-from gyrostab.diagnose.baseline.known_lines import average_in_bands, independent_line_share
+from gyrostab.diagnose.baseline.known_lines import independent_line_share
 from gyrostab.diagnose.baseline.posterior import DRAWS, Posterior
 from gyrostab.diagnose.baseline.quiescent import find_quiescent_spans, given_quiescent_blocks
 from gyrostab.diagnose.evidence.spectral_lines import interpolate_bands
+from gyrostab.diagnose.predict.linear_model import average_in_bands
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError, SchemaError

@@ -12,7 +12,6 @@ from scipy.special import chdtrc
 from gyrostab.diagnose.baseline.calibrate import MIN_BANDS, assemble_baseline, calibrate_axes
 from gyrostab.diagnose.baseline.expected_statistics import noise_powers, sum_noise
 from gyrostab.diagnose.baseline.from_model import scale_to_quiescent
-from gyrostab.diagnose.baseline.known_lines import average_in_bands
 from gyrostab.diagnose.baseline.posterior import Posterior
 from gyrostab.diagnose.baseline.quiescent import (
     find_quiescent_blocks,
@@ -21,7 +20,7 @@ from gyrostab.diagnose.baseline.quiescent import (
     noise_level_excess,
 )
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_evidence, line_skirt
-from gyrostab.diagnose.predict.linear_model import unspread_share
+from gyrostab.diagnose.predict.linear_model import average_in_bands, unspread_share
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables, weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, band_columns, line_columns
 from gyrostab.diagnose.baseline.known_lines import (
-    average_in_bands,
     expect_lines,
     independent_line_share,
     line_factors,
@@ -23,6 +22,7 @@ from gyrostab.diagnose.baseline.sample_transfer import undo_transfer
 from gyrostab.diagnose.predict.correlated_powers import with_correlated_powers
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import (
+    average_in_bands,
     cross_without,
     moves_within_blocks,
     spread_by_gaps,

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
 from gyrostab.diagnose.predict.filter_response import filter_factors
-from gyrostab.diagnose.predict.linear_model import unspread_share
+from gyrostab.diagnose.predict.linear_model import average_in_bands, unspread_share
 from gyrostab.diagnose.predict.windows import complex_factors, predict_effect
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES
-from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
+from gyrostab.kernels.spectra.periodogram import ordinates, taper
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.base import Effect
 
@@ -139,12 +139,6 @@ def _take_leakage(lines: NDArray[Any]) -> NDArray[Any]:
     """Return each line (..., line) and those that it leaks into, along another dimension."""
     padded = np.pad(lines, [(0, 0)] * (lines.ndim - 1) + [(LEAK_LINES, LEAK_LINES)])
     return np.lib.stride_tricks.sliding_window_view(padded, 2 * LEAK_LINES + 1, axis=-1)
-
-
-def average_in_bands(density: Array, blocks: xr.Dataset) -> Array:
-    """Average a density (..., line) over the lines of every band."""
-    edges = band_edges(int(blocks.attrs["block_samples"])) - 1
-    return np.asarray(np.add.reduceat(density, edges[:-1], axis=-1) / np.diff(edges))
 
 
 def independent_line_share(density: Array, blocks: xr.Dataset) -> Array:

@@ -80,13 +80,8 @@ def predict_baseline(
             known_of += [identification in left_out] * (len(columns) - len(known_of))
     weight = state.weight.copy()
     for row, axis in enumerate(state.axes):
-        dropped = np.array(
-            [
-                *is_left_out.get(("power", axis), []),
-                *is_left_out.get(("added_power", axis), []),
-            ],
-            np.bool_,
-        )
+        places = (("power", axis), ("added_power", axis))  # as in `State.power_columns`
+        dropped = np.array([flag for at in places for flag in is_left_out.get(at, [])], np.bool_)
         if dropped.any():
             weight[row] = fit_powers(state, axis, dropped)
     state = replace(state, blocks=usable_blocks, masked=identifications.state.masked)

@@ -98,6 +98,7 @@ def recalibrate(
     power = baseline["spectrum"].values.copy()
     columns = noise_powers(blocks)
     processes = _find_processes(fitted, blocks)
+    with_processes = baseline.assign(processes)
     changed, quiet = [], baseline["quiet"].values.copy()
     for row, axis in enumerate(state.axes):
         axis_effects = _collect_effects(identifications, baseline, fitted, axis)
@@ -106,7 +107,7 @@ def recalibrate(
         if axis_effects is not None and not has_walk:
             has_unidentified = any(axis in selection.axes for selection in identifications.unknown)
             chosen = use & ~state.masked[row] & (quiet[row] if has_unidentified else True)
-            wander = expected_processes(baseline.assign(processes), row)
+            wander = expected_processes(with_processes, row)
             posterior = _fit_noise(state, row, axis_effects, chosen, wander)
             if posterior is not None:
                 changed.append(axis)

@@ -150,7 +150,7 @@ def _factors_by_subset(
 
 
 def noise_columns(baseline: xr.Dataset, *, axis: str) -> tuple[Array, Array, Array]:
-    """Return the relative change of the spectrum per noise coefficient, and its prior precision.
+    """Return the relative change of the spectrum per noise coefficient, with prior and least size.
 
     N may take any value; Q changes by its value and error, B and K by three times that, because the
     spectrum cannot fall below what the other terms leave. The error of Q is that of its posterior,

@@ -9,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.reduce.schema import axis_values
+from gyrostab.kernels.spectra.expected import interval_variance
 
 Array = NDArray[np.float64]
 
@@ -49,19 +50,6 @@ def with_walk(baseline: xr.Dataset, axis: str, walk: Array) -> xr.Dataset:
     return baseline.assign(values)
 
 
-def block_mean_variance(step: float, time: Array) -> Array:
-    """Return the variance of means over `step` [s] of unit processes with correlation `time` [s].
-
-    Examples
-    --------
-    >>> block_mean_variance(1.0, np.array([1e6, 1.0])).round(3)  # 2 / e
-    array([1.   , 0.736])
-    """
-    a = step / np.maximum(time, 1e-300)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        return np.where(a > 1e-3, 2.0 * (a + np.expm1(-a)) / a**2, 1.0 - a / 3.0)
-
-
 def allan_variance(tau: float, time: Array) -> Array:
     """Return the Allan variance at `tau` [s] of unit processes with correlation `time` [s].
 
@@ -73,5 +61,5 @@ def allan_variance(tau: float, time: Array) -> Array:
     >>> allan_variance(1.0, np.array([1e-3, 0.5, 1e3])).round(4)
     array([0.002 , 0.3808, 0.0007])
     """
-    a = tau / np.maximum(time, 1e-300)
-    return np.asarray(block_mean_variance(tau, time) - (np.expm1(-a) / a) ** 2)
+    ratio = tau / time
+    return np.asarray(interval_variance(ratio) - (np.expm1(-ratio) / ratio) ** 2)

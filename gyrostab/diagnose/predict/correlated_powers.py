@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.predict.linear_model import average_in_bands
 from gyrostab.kernels.spectra.expected import correlated_powers
-from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
+from gyrostab.kernels.spectra.periodogram import ordinates, taper
 from gyrostab.physics.prediction import Prediction
 
 Array = NDArray[Any]
@@ -36,6 +36,4 @@ def with_correlated_powers(prediction: Prediction, blocks: xr.Dataset) -> Predic
 def _band_powers(blocks: xr.Dataset, time: float) -> Array:
     """Return the expected power (band,) of a process of unit variance [Hz-1]."""
     size, rate = int(blocks.attrs["block_samples"]), float(blocks.attrs["sampling_rate_hz"])
-    powers = correlated_powers(taper(size), rate, ordinates(size), time)
-    edges = band_edges(size) - 1
-    return np.array([powers[low:high].mean() for low, high in pairwise(edges)])
+    return average_in_bands(correlated_powers(taper(size), rate, ordinates(size), time), blocks)

@@ -18,7 +18,7 @@ from gyrostab.diagnose.evidence.held_out import LinearModel
 from gyrostab.diagnose.predict.candidates import Candidate, content_digest
 from gyrostab.diagnose.reduce.block_statistics import measured, pair_indices
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.kernels.spectra.periodogram import taper
+from gyrostab.kernels.spectra.periodogram import band_edges, taper
 
 Array = NDArray[Any]
 Result = TypeVar("Result")
@@ -122,6 +122,12 @@ def spread_by_gaps(density: Array, blocks: xr.Dataset, row: str = "axis") -> Arr
 def band_widths(blocks: xr.Dataset) -> Array:
     """Return the widths of the bands [Hz]."""
     return np.asarray(blocks["band_high"].values - blocks["band_low"].values)
+
+
+def average_in_bands(density: Array, blocks: xr.Dataset) -> Array:
+    """Average a density (..., line) over the lines of every band."""
+    edges = band_edges(int(blocks.attrs["block_samples"])) - 1
+    return np.asarray(np.add.reduceat(density, edges[:-1], axis=-1) / np.diff(edges))
 
 
 def mix_with_mean(density: Array, unspread: Array, width: Array) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.evidence.held_out import mean_factors, mean_residual, noise_weight
 from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.evidence.products import axis_noise
-from gyrostab.diagnose.evidence.wandering import block_mean_variance, expected_processes
+from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.predict.candidates import (
     TIME_PARAMETER,
     Candidate,
@@ -46,6 +46,7 @@ from gyrostab.kernels.regression.boxcars import (
     remaining_information,
 )
 from gyrostab.kernels.regression.state_space import flicker_states
+from gyrostab.kernels.spectra.expected import interval_variance
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Windows as PredictionWindows
 from gyrostab.units import HOUR
@@ -300,7 +301,7 @@ def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, series: Arra
     block, span = float(blocks.attrs["block_s"]), float(end[-1] - begin[0])
     share, times, white = flicker_states(block, span)
     processes = expected_processes(baseline, axis)
-    slow = np.append(b**2 * share, processes.square * block_mean_variance(block, processes.time))
+    slow = np.append(b**2 * share, processes.square * interval_variance(block / processes.time))
     times = np.append(times, processes.time)
     decay = np.exp(-step[:, None] / np.append(np.inf, times))  # the random walk does not relax
     variance = baseline["mean_variance"].values[axis] + b**2 * white

@@ -54,7 +54,7 @@ def solve_bounded(normal: Array, right: Array, low: Array) -> Array:
     normal, right : ndarray (n, n), (n,)
         Normal equations; `normal` is positive definite.
     low : ndarray (n,)
-        Least sizes; ``-inf`` where there is none.
+        Least sizes; ``-inf`` for those of any size.
 
     Returns
     -------

@@ -105,6 +105,24 @@ def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
     return np.asarray(powers / powers[1])
 
 
+def interval_variance(ratio: Array) -> Array:
+    """Compute the variance of the mean of a unit exponentially correlated process over an interval.
+
+    Parameters
+    ----------
+    ratio : ndarray
+        Interval over correlation time.
+
+    Examples
+    --------
+    >>> interval_variance(np.array([1e-6, 1.0])).round(3)  # 2 / e
+    array([1.   , 0.736])
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        law = 2.0 * (ratio + np.expm1(-ratio)) / ratio**2
+    return np.where(ratio > 1e-3, law, 1.0 - ratio / 3.0 + ratio**2 / 12.0)
+
+
 def correlated_powers(weights: Array, rate: float, ordinates: int, time: float) -> Array:
     """Compute the expected periodogram of an exponentially correlated process.
 
@@ -131,7 +149,7 @@ def correlated_powers(weights: Array, rate: float, ordinates: int, time: float) 
     lost = -math.expm1(-step)
     lag = np.arange(weights.size)
     covariance = (lost / step) ** 2 * np.exp(-step * np.maximum(lag - 1, 0))
-    covariance[0] = 2.0 * (step - lost) / step**2 if step > 1e-4 else 1.0 - step / 3.0
+    covariance[0] = interval_variance(np.array(step))
     white = np.zeros(weights.size)
     white[0] = rate
 

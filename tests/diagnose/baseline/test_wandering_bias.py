@@ -24,7 +24,7 @@ SLOW_HOPS = {"name": "telegraph", "step": [1.0], "low": 200.0, "high": 200.0}
 FAST_HOPS = {"name": "telegraph", "step": [1.0], "low": 30.0, "high": 60.0}
 
 
-def _simulate(effect: dict, seed: int, duration: str = "30min") -> tuple[dict, xr.Dataset]:
+def _simulate_effect(effect: dict, seed: int, duration: str = "30min") -> tuple[dict, xr.Dataset]:
     model = {"noise": NOISE, "effect": [effect]}
     log = simulate({**model, "log": {"axes": ["x"]}}, duration=duration, rate=10.0, seed=seed)
     return model, log.compute()
@@ -58,7 +58,7 @@ def test_allan_variance_is_that_of_ieee_std_952():
 
 @pytest.mark.parametrize("effect", [WANDER_30_S, WANDER_300_S], ids=["30 s", "300 s"])
 def test_powers_of_a_simulation_are_the_expected_ones(effect):
-    model, log = _simulate(effect, 3, "8h")
+    model, log = _simulate_effect(effect, 3, "8h")
     blocks = reduce_log(log, block="20s")
     expected = baseline_from_model(blocks, read_model(model))["spectrum"].values[0]
     ratio = np.nanmean(blocks["power"].values[0] / expected, axis=0)
@@ -74,7 +74,7 @@ def test_powers_of_a_simulation_are_the_expected_ones(effect):
 )
 def test_no_mismatch_against_its_own_model(effect):
     for seed in (7, 8):
-        model, log = _simulate(effect, seed)
+        model, log = _simulate_effect(effect, seed)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             diagnosis = diagnose(log, simulation=model, nulls=100)

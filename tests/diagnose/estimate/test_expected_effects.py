@@ -9,9 +9,10 @@ from scipy import signal
 import gyrostab
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
-from gyrostab.diagnose.evidence.wandering import block_mean_variance, expected_processes
+from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.kernels.spectra.expected import interval_variance
 from gyrostab.simulate import simulate
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
@@ -101,7 +102,7 @@ def test_null_means_wander_like_the_model(blocks, memory, rms):
     assert (drawn[:, 1:] * drawn[:, :-1]).mean() == pytest.approx(
         rms**2 * next_one, rel=0.08, abs=0.02 * rms**2
     )
-    assert block_mean_variance(a, np.array([1.0])) == pytest.approx(own)
+    assert interval_variance(np.array([a])) == pytest.approx(own)
 
 
 def test_null_means_walk_during_vibration(blocks):
