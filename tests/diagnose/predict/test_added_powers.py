@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
 
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import fit_powers
 from gyrostab.diagnose.predict.linear_model import State, initial_state
+from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.diagnose.statistics import find_statistic
 from tests.support.named import record
 
 NOISE = {"N": 0.003}
@@ -33,3 +38,34 @@ def test_added_power_is_not_negative(state, kind, lowest):
     fitted = fit_powers(state.with_columns(kind, "x", [column]), "x")
     ratio = fitted[is_quieter] / fitted[~is_quieter][:1]
     assert ratio.min() == pytest.approx(lowest, abs=0.05)
+
+
+def two_terms(state: State, columns: tuple[str, ...]) -> Component:
+    """White noise and noise that rises with the frequency, added in half of the blocks."""
+    frequency = state.blocks["frequency"].values / state.blocks["frequency"].values.max()
+    is_quieter = np.arange(state.blocks.sizes["block"]) < state.blocks.sizes["block"] // 2
+    shapes = {"white": np.ones_like(frequency), "quantization": frequency**2}
+    level = float(state.baseline["spectrum"].mean())
+    design = np.stack([level * is_quieter[:, None] * shapes[name] for name in columns])[:, None]
+    variant = Variant({}, columns, design, squared=True)
+    candidate = Candidate("vibration_noise", find_statistic("power"), ("vibration",), (variant,))
+    return Component(candidate, variant, ("x",), 100.0)
+
+
+def test_size_next_to_a_negative_one_is_that_without_it(state):
+    course = two_terms(state, ("white", "quantization")).variant.design[:, 0]
+    changed = state.blocks.assign(power=state.baseline["spectrum"] + course[0] - 0.9 * course[1])
+    state = replace(state, blocks=changed)
+    both, alone = (
+        component_mixture(two_terms(state, columns), state).mean[0]
+        for columns in (("white", "quantization"), ("white",))
+    )
+    assert both[0] == pytest.approx(alone[0])
+    assert both[1] < 0.0
+    assert alone[0] < 0.95
+
+
+def test_evidence_takes_added_powers_for_positive(state):
+    component = two_terms(state, ("white",))
+    model = component.statistic.model([component.candidate], 0, state.blocks, state)
+    assert list(model.is_bounded) == [True]
