@@ -62,40 +62,33 @@ def guess_unit(
     warnings: list[str],
     *,
     angles: bool,
-) -> str | None:
+) -> str:
     """Guess the unit of the gyro columns, and add the reasons and warnings.
 
-    None if the header gives a unit that is not known.
+    A unit in the header that is not known leaves the guess to names and numbers.
     """
     group = list(axes.values())
     for column in group:
-        named = name_unit(column, "rate")
+        in_header = given_unit(column)
+        named = column.unit if in_header else name_unit(column, "rate")
         if named is None and not angles and (angle := name_unit(column, "angle")):
             named = f"{angle}/s"
         if named is not None and is_unit_of(named, ("rate",)):
-            reasons.append(f"unit {named}, by name")
+            reasons.append(f"unit {named}, by {'that of another axis' if in_header else 'name'}")
             return named
+    units = {column.unit: _is_known(column.unit) for column in group if column.unit}
+    warnings += [
+        f"the unit {unit!r} of the gyro is not known"
+        for unit, is_known in units.items()
+        if not is_known
+    ]
     if angles:
         warnings.append(
-            "the file does not state the unit of the angles; deg is an assumption, put the "
-            "true one in its place"
+            "the file states no known unit of the angles; deg is an assumption, put the true one "
+            "in its place"
         )
         return "deg"
-    units = [column.unit for column in group if column.unit]
-    unknown = next(
-        (
-            unit
-            for unit in units
-            if not (is_unit(unit) or is_unit_of(unit, ("number",)) or _names_counts(unit))
-        ),
-        None,
-    )
-    if unknown is not None:
-        warnings.append(
-            f"the unit {unknown!r} of the gyro is not known: give it with --unit gyro=deg/s"
-        )
-        return None
-    counts = units or any(_names_counts(column.key) for column in group)
+    counts = any(units.values()) or any(_names_counts(column.key) for column in group)
     large = (
         inspection.summary.format == "miniseed"
         and max(max(abs(c.low), abs(c.high)) for c in group) > 10.0
@@ -117,10 +110,14 @@ def guess_unit(
         f"{np.linalg.norm(means) * factor:.4g} deg/h"
     )
     warnings.append(
-        f"the unit {unit} is a guess from the numbers, as the file says none; check it with the "
-        "data sheet"
+        f"the unit {unit} is a guess from the numbers, as the file states no known unit; check it "
+        "with the data sheet"
     )
     return unit
+
+
+def _is_known(unit: str) -> bool:
+    return is_unit(unit) or is_unit_of(unit, ("number",)) or _names_counts(unit)
 
 
 def _names_counts(text: str) -> bool:

@@ -410,13 +410,37 @@ def test_file_that_no_guess_reads_ends_with_its_error(tmp_path: Path, capsys) ->
         assert "next:" not in shown.out
 
 
-def test_unknown_unit_of_the_gyro_gets_no_scale(tmp_path: Path, capsys) -> None:
-    path = write(tmp_path / "log.csv", {"time [s]": TIME, "gyro_x [furlong]": GX})
-    assert call("scan", path) == 2
+@pytest.mark.parametrize("unit", ["furlong", "0 deg/s", "counts of x"])
+@pytest.mark.parametrize("stem", ["gyro", "angle"])
+def test_unknown_unit_is_guessed_like_a_missing_one(
+    tmp_path: Path, monkeypatch, capsys, stem: str, unit: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    columns = {"time [s]": TIME, f"{stem}_x": GX, f"{stem}_y": GY}
+    missing = write(tmp_path / "missing.csv", columns)
+    assert call("scan", missing) == 0
+    expected = next_command(capsys.readouterr().out)
+    unknown = write(
+        tmp_path / "log.csv", {k.replace("_x", f"_x [{unit}]"): v for k, v in columns.items()}
+    )
+    assert call("scan", unknown) == 0
     shown = capsys.readouterr()
-    assert "the unit 'furlong' of the gyro is not known" in shown.out
-    assert "a count" not in shown.out
-    assert "unit 'furlong' is not known" in shown.err
+    command = next_command(shown.out)
+    if "count" not in unit:
+        assert f"check: the unit {unit!r} of the gyro is not known" in shown.out
+        assert command[2:] == expected[2:]
+    assert call(*command, "--window", "5s", "--step", "5s") == 0
+
+
+def test_axis_of_unknown_unit_has_that_of_the_other_axes(tmp_path: Path, capsys) -> None:
+    path = write(
+        tmp_path / "log.csv",
+        {"time [s]": TIME, "gyro_x [furlong]": GX, "gyro_y [rpm]": GY, "gyro_z": GZ},
+    )
+    assert call("scan", path) == 0
+    shown = capsys.readouterr().out
+    assert "unit rpm, by that of another axis" in shown
+    assert "gyro=rpm" in next_command(shown)
 
 
 @pytest.mark.parametrize(

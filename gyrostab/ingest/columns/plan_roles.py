@@ -155,15 +155,14 @@ def _plan_axis(plan: Plan, column: Header) -> str | None:
     try:
         unit = parse_unit(text, quantity)
     except UnitError as error:
-        if "factor" in str(error):
-            plan.refuse(UnitError, f"column {column.header!r}: {error}")
-            return None
-        refuse(
-            UnitError,
-            f"column {column.header!r}: unit {text!r} is not known; known are "
-            f"{known_units('rate')}; give it with --unit {stem}={example}, or with a factor "
-            f'--unit "{stem}=0.1 arcsec/s"',
-        )
+        problem = f"column {column.header!r}: {error}"
+        if "factor" not in str(error):
+            problem = (
+                f"column {column.header!r}: unit {text!r} is not known; known are "
+                f"{known_units('rate')}; give it with --unit {stem}={example}, or with a factor "
+                f'--unit "{stem}=0.1 arcsec/s"'
+            )
+        refuse(UnitError, problem)
         return None
     if unit.quantity not in allowed:
         refuse(
