@@ -25,8 +25,6 @@ import pandas as pd
 from gyrostab.errors import FormatError, GyrostabError, WorkerError
 from gyrostab.io.opening import open_dataset
 from gyrostab.jobs.archive import (
-    DIAGNOSIS,
-    Archive,
     LogRun,
     find_archive,
     find_runs,
@@ -39,9 +37,11 @@ from gyrostab.jobs.fleet_output import (
     REQUESTS,
     begin_output,
     check_address,
+    check_update,
     consolidate_metadata,
     make_folder,
     make_folders,
+    read_options,
 )
 from gyrostab.jobs.fleet_table import (
     FILES,
@@ -49,6 +49,7 @@ from gyrostab.jobs.fleet_table import (
     is_zarr,
     list_effects,
     make_table,
+    open_archive,
     product_path,
     read_rows,
     read_table,
@@ -56,7 +57,13 @@ from gyrostab.jobs.fleet_table import (
     write_rows,
     write_table,
 )
-from gyrostab.jobs.job import check_job_folder, job_folder, lock_job, remove_job
+from gyrostab.jobs.job import (
+    check_job_folder,
+    job_folder,
+    lock_job,
+    make_fingerprint,
+    remove_job,
+)
 from gyrostab.jobs.run import find_job_name, read_job_name, run
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
 from gyrostab.progress import Stage, no_stage
@@ -93,8 +100,9 @@ def write_file_table(
     """Write the table of the files of an archive, which `run_fleet` takes in place of the archive.
 
     The table is that of `gyrostab.jobs.archive.index_files`, in a Parquet file, which may be at an
-    address. An earlier table is brought up to date: files that have not changed are not opened
-    again, except with `overwrite`. The other options are those of `run_fleet`.
+    address. An earlier table of the same archive and options is brought up to date: files that have
+    not changed are not opened again, except with `overwrite`, which replaces any table of files.
+    The other options, and errors, are those of `run_fleet`.
     """
     scheduler = check_scheduler(scheduler)
     known_table = read_table(Path(output), content=FILES)
@@ -103,6 +111,11 @@ def write_file_table(
     else:
         check_output(output, suffixes=[".parquet"], overwrite=overwrite or known_table is not None)
     archive = find_archive(paths)
+    if known_table is not None and known_table["is_log"].any() and not overwrite:
+        known_options = json.loads(known_table["options"].iloc[0])
+        check_update(
+            output, archive, reading or {}, known_table=known_table, known_options=known_options
+        )
     with _open_workers(scheduler, workers, archive.files[:1]) as pool:
         table = index_files(
             archive,
@@ -132,9 +145,9 @@ def run_fleet(
 ) -> pd.DataFrame:
     """Analyse the runs of an archive: a product for each, a table of all, reports and an overview.
 
-    Runs are independent: one that fails is a row with its error. A second call computes only runs
-    whose files, options or versions have changed, and those that failed. A call that was stopped or
-    killed is continued in the same way.
+    Runs are independent: one that fails is a row with its error. A second call of the same archive
+    and options computes only runs whose files or versions have changed, and those that failed. A
+    call that was stopped or killed is continued in the same way.
 
     Parameters
     ----------
@@ -154,7 +167,8 @@ def run_fleet(
     reports : bool
         Whether each run gets a report.
     overwrite : bool
-        Compute all runs again.
+        Compute all runs again, also with other options or for another archive, whose runs replace
+        those of the same names.
     scheduler : str
         ``processes``, the address of a dask.distributed scheduler, whose workers must see the
         archive and the output under the same names, or ``threads``: one run after the other in this
@@ -176,7 +190,7 @@ def run_fleet(
     WorkerError, KeyboardInterrupt
         When the workers fail, or at an interruption; the message says how much is done.
     OutputError, OptionError
-        When the output or an option is wrong.
+        When the output or an option is wrong, or the output has results of other files or options.
     """
     scheduler = check_scheduler(scheduler)
     options = check_options(reading=reading, windows=windows, fitting=fitting)
@@ -188,8 +202,17 @@ def run_fleet(
     check_job_folder(job_folder(target))
     with protect_inputs(paths), lock_job(job_folder(target)):
         try:
-            begin_output(target, reports=reports)
-            archive, known_table = _open_archive(paths, target)
+            archive, known_table = open_archive(paths, target)
+            given_options = {**make_fingerprint([], options)["options"], "per": per}
+            if not overwrite and any(not row["error"] for row in read_rows(target).values()):
+                check_update(
+                    output,
+                    archive,
+                    given_options,
+                    known_table=read_table(target / "files.parquet", content=FILES),
+                    known_options=read_options(target),
+                )
+            begin_output(target, given_options, reports=reports)
             with _open_workers(scheduler, workers, [target, *archive.files[:1]]) as pool:
                 table = index_files(
                     archive, reading=options["reading"], known=known_table, pool=pool, stage=stage
@@ -232,21 +255,6 @@ def _open_workers(
 def _find_foreign(folder: Path) -> str | None:
     """Return an item of a folder that is not a fleet; None for a fleet and an empty folder."""
     return None if is_fleet(folder) else min(os.listdir(folder), default=None)
-
-
-def _open_archive(paths: Sequence[str | Path], target: Path) -> tuple[Archive, pd.DataFrame | None]:
-    """List an archive, or take the files of a table; return the latest table of its files too."""
-    known_table = read_table(target / "files.parquet", content=FILES)
-    if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".parquet":
-        given_table = read_table(Path(paths[0]), content=FILES)
-        if given_table is not None:
-            is_diagnosis = given_table["format"] == DIAGNOSIS
-            files, diagnoses = (
-                [Path(name) for name in given_table.loc[part, "file"]]
-                for part in (~is_diagnosis, is_diagnosis)
-            )
-            return Archive(Path(given_table["base"].iloc[0]), files, diagnoses), given_table
-    return find_archive(paths), known_table
 
 
 def _compute_runs(

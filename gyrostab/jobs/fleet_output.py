@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from gyrostab.errors import OptionError, OutputError
-from gyrostab.jobs.archive import FLEET_MARK, FLEET_SCHEMA
+from gyrostab.jobs.archive import FLEET_MARK, FLEET_SCHEMA, Archive
 from gyrostab.jobs.fleet_table import is_zarr
+from gyrostab.jobs.job import describe_differences
 from gyrostab.store.output import read_json, write_text
-from gyrostab.store.remote import find_kind, find_url, has_file
+from gyrostab.store.remote import find_kind, find_url, full_name, has_file
 
 REQUESTS = 16  # to an object store at a time
 _GROUP = {"zarr_format": 2}  # metadata of a Zarr group
@@ -30,13 +34,57 @@ def check_address(url: str, suffix: str, *, is_own: bool) -> None:
         )
 
 
-def begin_output(target: Path, *, reports: bool) -> None:
-    """Mark the output as a fleet, and write what its reports share."""
+def check_update(
+    output: str | Path,
+    archive: Archive,
+    options: Mapping[str, Any],
+    *,
+    known_table: pd.DataFrame | None,
+    known_options: Mapping[str, Any],
+) -> None:
+    """Check that an earlier output is of this archive and these options, to bring it up to date.
+
+    Files that are gone, or new, are those of the same archive.
+
+    Raises
+    ------
+    OutputError
+        When the earlier output lists a file that still exists and is not in the archive, or has
+        other options.
+    """
+    listed = {full_name(path) for path in [*archive.files, *archive.diagnoses]}
+    known_names = [] if known_table is None else known_table["file"]
+    other = next((name for name in known_names if name not in listed and _exists(name)), None)
+    plain = json.loads(json.dumps(options, default=str))
+    before, now = (
+        {"inputs": [], "options": values, "versions": {}} for values in (known_options, plain)
+    )
+    changes = f"it is also of {other}" if other else describe_differences(before, now)
+    if changes:
+        raise OutputError(
+            f"output {str(output)!r} exists already, and {changes}; give the same archive and "
+            "options to bring it up to date, --overwrite (overwrite=True) to replace its results, "
+            "or another name with -o"
+        )
+
+
+def _exists(name: str) -> bool:
+    url = find_url(name)
+    return bool(find_kind(url, required=False)) if url else os.path.exists(name)
+
+
+def read_options(target: Path) -> dict[str, Any]:
+    """Read the options of an earlier call from the mark of a fleet."""
+    return dict((read_json(target / FLEET_MARK) or {}).get("options", {}))
+
+
+def begin_output(target: Path, options: Mapping[str, Any], *, reports: bool) -> None:
+    """Mark the output as a fleet of these options, and write what its reports share."""
     from gyrostab.report.charts import plotly_script
 
     if not find_url(target):
         target.mkdir(exist_ok=True)
-    write_text(target / FLEET_MARK, json.dumps({"schema": FLEET_SCHEMA}))
+    write_text(target / FLEET_MARK, json.dumps({"schema": FLEET_SCHEMA, "options": options}))
     if is_zarr(target):
         write_text(target / ".zgroup", json.dumps(_GROUP))
     if reports:

@@ -11,7 +11,14 @@ import pandas as pd
 import xarray as xr
 
 from gyrostab.io.opening import open_dataset
-from gyrostab.jobs.archive import LogRun, is_fleet, read_diagnosis
+from gyrostab.jobs.archive import (
+    DIAGNOSIS,
+    Archive,
+    LogRun,
+    find_archive,
+    is_fleet,
+    read_diagnosis,
+)
 from gyrostab.noise import LAWS
 from gyrostab.schema import texts
 from gyrostab.store.output import new_output
@@ -64,6 +71,21 @@ def read_table(path: Path, *, content: str) -> pd.DataFrame | None:
         return None
     frame: pd.DataFrame = table.to_pandas()
     return frame
+
+
+def open_archive(paths: Sequence[str | Path], target: Path) -> tuple[Archive, pd.DataFrame | None]:
+    """List an archive, or take the files of a table; return the latest table of its files too."""
+    known_table = read_table(target / "files.parquet", content=FILES)
+    if len(paths) == 1 and Path(paths[0]).suffix.lower() == ".parquet":
+        given_table = read_table(Path(paths[0]), content=FILES)
+        if given_table is not None:
+            is_diagnosis = given_table["format"] == DIAGNOSIS
+            files, diagnoses = (
+                [Path(name) for name in given_table.loc[part, "file"]]
+                for part in (~is_diagnosis, is_diagnosis)
+            )
+            return Archive(Path(given_table["base"].iloc[0]), files, diagnoses), given_table
+    return find_archive(paths), known_table
 
 
 def is_zarr(target: Path) -> bool:

@@ -39,16 +39,16 @@ from gyrostab.jobs.job import (
 )
 from gyrostab.jobs.load import load_log
 from gyrostab.kernels.workspace import Workspace
-from gyrostab.schema import log_channels, signal_name
+from gyrostab.schema import log_channels, signal_name, texts
 from gyrostab.store.lazy import find_source
 from gyrostab.store.output import check_output, follow_inputs, resolve_link
-from gyrostab.store.remote import find_url
+from gyrostab.store.remote import find_url, full_name
 from gyrostab.store.system import release_memory, return_large_arrays
 from gyrostab.time.durations import duration_seconds, samples
 from gyrostab.time.grid import first_stamp, grid_times
 
-#: Attribute of the product with the options that made it.
-_OPTIONS = "gyrostab_watch"
+#: Attribute of the product with the source and the options that made it.
+_IDENTITY = "gyrostab_watch"
 #: Largest share of the time that is spent on updates: after a long one, the next one waits.
 _MAX_WORK_SHARE = 0.1
 #: Share of the bytes that the next window is estimated to need from which on files are read.
@@ -101,7 +101,8 @@ def watch(
         A folder, a pattern or a file; or ``-`` for rows of `stream`, which are kept in
         `rows_folder`.
     output : path
-        Zarr store. One that this function made with the same options is continued.
+        Zarr store. One that this function made of the same source with the same options is
+        continued.
     listener : Listener
         Receives windows, alarms and notes.
     reading, windows, fitting : mapping
@@ -129,7 +130,8 @@ def watch(
     Raises
     ------
     OutputError
-        When the output exists and is not that of the same options, or cannot be written.
+        When the output exists and is not that of the same source, its files and options, or cannot
+        be written.
     OptionError, UnitError
         When an option or the unit of a column is wrong or missing.
     FormatError
@@ -142,7 +144,10 @@ def watch(
     quiet = duration_seconds(idle, "--idle") if idle else np.inf
     path = Path(output)
     with follow_inputs([] if source == "-" else [source]):
-        until = _continue_product(path, options, overwrite=overwrite)
+        identity = make_fingerprint([], options)
+        identity["inputs"] = [{"path": source if source == "-" else full_name(source)}]
+        place = str(rows_folder(path)) if source == "-" else source
+        until = _continue_product(path, place, identity, overwrite=overwrite)
         folder = job_folder(resolve_link(path))
         with lock_job(folder):
             try:
@@ -150,9 +155,9 @@ def watch(
                 if source == "-":
                     _check_rows(path, overwrite=overwrite)
                     keeper = RowKeeper(stream or sys.stdin.buffer, rows_folder(path))
-                    source = str(rows_folder(path))
-                view = _View(path, options, wait, list(alarms), listener, until)
-                _follow_source(view, source, keeper, quiet, poll)
+                attrs = {_IDENTITY: json.dumps(identity)}
+                view = _View(path, options, attrs, wait, list(alarms), listener, until)
+                _follow_source(view, place, keeper, quiet, poll)
             finally:
                 remove_job(folder, output=resolve_link(path))
     return path
@@ -190,27 +195,36 @@ def _check_rows(path: Path, *, overwrite: bool) -> None:
 
 
 def _continue_product(
-    path: Path, options: dict[str, Any], *, overwrite: bool
+    path: Path, place: str, identity: dict[str, Any], *, overwrite: bool
 ) -> np.datetime64 | None:
-    """Check that the output can be written; find the last window of one that is continued."""
+    """Check that the output can be written; find the last window of one that is continued.
+
+    The files of the source are at `place`.
+    """
     if find_url(path):
         raise OptionError(
             f"{find_url(path)}: a live view writes to a local store; copy it to the address with "
             "a tool such as aws s3 sync"
         )
-    old_options = None
+    before = None
     if path.exists() and not overwrite:
         with contextlib.suppress(GyrostabError), open_product(path) as product:
-            old_options = product.attrs.get(_OPTIONS)
+            before = product.attrs.get(_IDENTITY)
             until: np.datetime64 = product["time"].values[-1]
-    if old_options is None:
+            names = texts(product, "source_files")
+    if before is None:
         check_output(path, suffixes=[".zarr"], overwrite=overwrite)
         return None
     check_output(path, suffixes=[".zarr"], overwrite=True)
-    if changes := describe_differences(json.loads(old_options), make_fingerprint([], options)):
+    present = {file.name for file in list_files(place)}
+    gone = next((name for name in names if name not in present), None)
+    changes = describe_differences(json.loads(before), identity)
+    if gone and not changes:
+        changes = f"{place} has no {gone} any more, whose windows it holds"
+    if changes:
         raise OutputError(
-            f"output {str(path)!r} exists already, and {changes}; give the same options to "
-            "continue it, --overwrite to replace it, or another name with -o"
+            f"output {str(path)!r} exists already, and {changes}; give the same files and options "
+            "to continue it, --overwrite to replace it, or another name with -o"
         )
     return until
 
@@ -222,12 +236,13 @@ class _View:
         self,
         path: Path,
         options: dict[str, Any],
+        attrs: dict[str, str],
         lateness: float,
         alarms: list[Alarm],
         listener: Listener,
         until: np.datetime64 | None,
     ):
-        self.path, self.options, self.lateness = path, options, lateness
+        self.path, self.options, self.attrs, self.lateness = path, options, attrs, lateness
         self.alarms, self.listener = alarms, listener
         self.until = until  # last window that this call, or an earlier one, has shown
         self.exists = until is not None
@@ -341,7 +356,6 @@ class _View:
         same = [i < len(old) and old[i] == digest for i, digest in enumerate(digests)]
         if all(same) and len(old) == len(digests):
             return
-        attrs = {_OPTIONS: json.dumps(make_fingerprint([], self.options))}
 
         def compute(parts: Sequence[slice]) -> Iterator[tuple[slice, xr.Dataset]]:
             for part in parts:
@@ -349,7 +363,7 @@ class _View:
                 windows = describe_windows(result.isel(time=slice(self.shown - part.start, None)))
                 if windows and not self.shown:
                     check_alarms(self.alarms, windows[0])
-                yield part, result.assign_attrs(attrs)
+                yield part, result.assign_attrs(self.attrs)
                 self._show_windows(windows)
 
         changed = [part for part, is_same in zip(units, same, strict=True) if not is_same]

@@ -237,6 +237,59 @@ def test_a_second_call_computes_what_is_new_changed_or_failed(tmp_path, computed
     assert computed == []
 
 
+def test_results_of_other_files_or_options_are_replaced_with_overwrite_only(tmp_path, computed):
+    output = tmp_path / "fleet"
+    for folder, minutes in (("spring", 5.0), ("autumn", 6.0)):
+        write_log(tmp_path / folder / "run" / "log.nc", 5, minutes=minutes)
+    run_fleet([tmp_path / "spring"], output, **OPTIONS)
+    before = (output / "run.nc").read_bytes()
+    others = {
+        r"it is also of .*spring/run/log\.nc": {"paths": [tmp_path / "autumn"]},
+        "per is file, was folder": {"per": "file"},
+        "window is 2min, was ": {"windows": {"window": "2min"}},
+    }
+    for message, options in others.items():
+        given = {"paths": [tmp_path / "spring"], **OPTIONS, **options}
+        with pytest.raises(OutputError, match=f"exists already, and {message}.*--overwrite"):
+            run_fleet(output=output, **given)
+    assert (output / "run.nc").read_bytes() == before
+    del computed[:]
+    run_fleet([tmp_path / "spring"], output, **OPTIONS)
+    assert computed == []
+    table = run_fleet([tmp_path / "autumn"], output, **OPTIONS, overwrite=True)
+    assert list(table["span [s]"]) == [360.0]
+
+
+def test_runs_that_failed_are_computed_with_other_options(tmp_path):
+    archive, output = tmp_path / "archive", tmp_path / "fleet"
+    write_log(archive / "run" / "log.nc", 5)
+    too_long = {**OPTIONS, "windows": {"window": "1h"}}
+    with pytest.raises(FormatError, match="1 of 1 runs failed"), pytest.warns(match="run: "):
+        run_fleet([archive], output, **too_long)
+    assert list(run_fleet([archive], output, **OPTIONS)["error"]) == [""]
+
+
+def test_a_table_of_other_files_is_replaced_with_overwrite_only(tmp_path):
+    table, folders = tmp_path / "files.parquet", [tmp_path / "spring", tmp_path / "autumn"]
+    for folder in folders:
+        write_log(folder / "log.nc", 5)
+    names = [str(folder / "log.nc") for folder in folders]
+    write_file_table(folders[:1], table, scheduler="threads")
+    before = table.read_bytes()
+    with pytest.raises(OutputError, match=r"it is also of .*spring/log\.nc"):
+        write_file_table(folders[1:], table, scheduler="threads")
+    with pytest.raises(OutputError, match="kind is angle, was not given"):
+        write_file_table(folders[:1], table, scheduler="threads", reading={"kind": "angle"})
+    assert table.read_bytes() == before
+    assert sorted(write_file_table(folders, table, scheduler="threads")["file"]) == sorted(names)
+    (folders[0] / "log.nc").unlink()
+    (folders[0] / "new.nc").write_bytes((folders[1] / "log.nc").read_bytes())
+    updated = write_file_table(folders, table, scheduler="threads")
+    assert sorted(updated["file"]) == sorted([str(folders[0] / "new.nc"), names[1]])
+    replaced = write_file_table(folders[1:], table, scheduler="threads", overwrite=True)
+    assert list(replaced["file"]) == names[1:]
+
+
 def test_a_changed_layout_of_a_binary_log_counts_as_a_change(tmp_path, computed):
     log, output, means = tmp_path / "archive" / "run" / "log.bin", tmp_path / "fleet", []
     log.parent.mkdir(parents=True)

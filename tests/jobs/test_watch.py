@@ -176,7 +176,7 @@ def test_a_file_that_comes_late_changes_earlier_windows(rows, tmp_path):
 def test_a_file_that_is_cut_is_followed_on(tmp_path):
     rows, recorder = make_rows(12_000), Recorder()
     source, output = tmp_path / "log.csv", tmp_path / "live.zarr"
-    view = module._View(output, check_options(windows=WINDOWS), 0.0, [], recorder, None)
+    view = module._View(output, check_options(windows=WINDOWS), {}, 0.0, [], recorder, None)
     for count in (8_000, 5_000, 6_500, 12_000):
         source.write_text(HEADER + "".join(rows[:count]))
         view.take_files(follow_module.list_files(str(source)))
@@ -324,6 +324,31 @@ def test_other_options_and_foreign_outputs_are_refused(tmp_path):
     with pytest.raises(OptionError, match=r"must end in \.zarr"):
         follow(source, tmp_path / "a.nc")
     assert not list(tmp_path.glob(".*"))
+
+
+def test_a_product_of_another_source_or_of_files_that_are_gone_is_refused(tmp_path):
+    output, probe = tmp_path / "live.zarr", tmp_path / "probe.csv"
+    probe.write_text("time [s],pressure [Pa]\n0,1\n200,2\n")
+    options = {"reading": {"channel": [probe]}}
+    for name in ("run 7", "run 8"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a.csv").write_text(HEADER + "".join(make_rows(3_000)))
+    follow(tmp_path / "run 7", output, **options)
+    before = {path: path.read_bytes() for path in output.rglob("*") if path.is_file()}
+    with pytest.raises(OutputError, match=r"run 8 is given now.*run 7 was given before"):
+        follow(tmp_path / "run 8", output, **options)
+    (tmp_path / "run 7" / "a.csv").rename(tmp_path / "run 7" / "b.csv")
+    with pytest.raises(OutputError, match=r"run 7 has no a\.csv any more"):
+        follow(tmp_path / "run 7", output, **options)
+    assert before == {path: path.read_bytes() for path in output.rglob("*") if path.is_file()}
+    (tmp_path / "run 7" / "b.csv").rename(tmp_path / "run 7" / "a.csv")
+    (tmp_path / "run 7" / "c.csv").write_text(HEADER + "".join(make_rows(6_000)[3_000:]))
+    follow(tmp_path / "run 7", output, **options)
+    with open_product(output) as product:
+        assert product.sizes["time"] == 6
+    follow(tmp_path / "run 8", output, **options, overwrite=True)
+    with open_product(output) as product:
+        assert product.sizes["time"] == 3
 
 
 def test_what_cannot_be_followed_is_said(tmp_path):

@@ -32,7 +32,8 @@ def index(
 ) -> None:
     """List the logs of an archive in a table: span, rate, axes, channels and rows of each file.
 
-    An existing table is brought up to date: files that have not changed are not opened again.
+    When repeated, the command continues its table without --overwrite: files that have not changed
+    are not opened again. --overwrite is needed to replace a table of other files or options.
     gyrostab fleet takes the table in place of the archive, and opens only the logs it computes.
 
     Example: gyrostab index /archive -o files.parquet
@@ -79,8 +80,9 @@ def fleet(
 ) -> None:
     """Analyse many runs: a product for each, a table of all, reports, and an overview page.
 
-    The logs of a folder are one run. When repeated, the command computes only runs that are new,
-    have changed or have failed; it also continues a call that was stopped.
+    The logs of a folder are one run. When repeated, the command continues its output without
+    --overwrite, also after a stop: it computes only runs that are new, have changed or have failed.
+    --overwrite is needed to replace results of other files or options, and computes all runs.
 
     Example: gyrostab fleet /archive -o fleet --window 10min
 

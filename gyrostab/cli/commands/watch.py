@@ -34,7 +34,8 @@ def watch(
     """Follow logs that grow: append each window to a Zarr product, and print a line for it.
 
     The product is bit for bit that of gyrostab run on the rows so far. Ctrl-C writes the last
-    windows and ends; repeat the command to continue.
+    windows and ends; the same command continues the product without --overwrite. --overwrite is
+    needed to replace a product of another source, of files that are gone, or of other options.
 
     Example: gyrostab watch /data/run7 -o run7-live.zarr --window 10min --serve 8080
 
