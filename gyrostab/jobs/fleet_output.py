@@ -56,10 +56,12 @@ def check_update(
     known_names = [] if known_table is None else known_table["file"]
     other = next((name for name in known_names if name not in listed and _exists(name)), None)
     plain = json.loads(json.dumps(options, default=str))
-    before, now = (
-        {"inputs": [], "options": values, "versions": {}} for values in (known_options, plain)
+    same: dict[str, Any] = {"inputs": [], "versions": {}}
+    changes = (
+        f"it is also of {other}"
+        if other
+        else describe_differences({**same, "options": known_options}, {**same, "options": plain})
     )
-    changes = f"it is also of {other}" if other else describe_differences(before, now)
     if changes:
         raise OutputError(
             f"output {str(output)!r} exists already, and {changes}; give the same archive and "

@@ -17,7 +17,8 @@
     if (layout.scene) layout.scene.yaxis.dtick = 1;
     const scales = [...data, layout.coloraxis ?? {}].filter((item) => item.colorbar);
     for (const { colorbar } of scales) {
-      Object.assign(colorbar, { orientation: "h", yref: "container", y: 1, yanchor: "top", thickness: 12 });
+      const title = { ...colorbar.title, side: "top" };
+      Object.assign(colorbar, { title, orientation: "h", yref: "container", y: 1, yanchor: "top", thickness: 12 });
       layout.margin = { ...layout.margin, t: 90 };
     }
     for (const note of layout.annotations ?? []) {

@@ -34,6 +34,12 @@ _RED = "#D00000"
 _CASES = {"before": "simulation before", "after": "simulation after"}
 _MAX_CHANNELS = 3  # panels below the means
 _INSIDE_BAND_OPACITY = 0.3  # of cells inside the 95 % band
+#: Labels of ticks less than a minute, or a day, apart [ms]: dates without the year, so that
+#: those of panels side by side do not touch.
+_SHORT_DATES = [
+    {"dtickrange": [1_000, 59_999], "value": "%H:%M:%S\n%b %-d"},
+    {"dtickrange": [60_000, 86_399_999], "value": "%H:%M\n%b %-d"},
+]
 
 
 def diagnosis_charts(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[Chart]:
@@ -129,7 +135,7 @@ def draw_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
     for row, name in enumerate(names, start=1):
         title = f"axis {plain_text(name)}<br>{TAU_LABEL}"
         frame.update_yaxes(title={"text": title, "font": {"size": 12}}, col=1, row=row)
-    frame.update_xaxes(type="date")
+    frame.update_xaxes(type="date", tickformatstops=_SHORT_DATES)
     for row, name in enumerate(names):
         for region in _find_regions(content, name, over_tau=True):
             _frame_region(frame, region, row)
@@ -139,6 +145,7 @@ def draw_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
         coloraxis={
             "colorscale": CHANGE_CMAP, "cmin": -1, "cmax": 1,
             "colorbar": {
+                "title": {"text": "σ(τ), recording / simulation [1]", "side": "right"},
                 "tickvals": [-1, -0.5, 0, 0.5, 1], "ticktext": ["≤ 0.5", "0.7", "1", "1.4", "≥ 2"],
             },
         },

@@ -83,6 +83,7 @@ def draw_static(chart: go.Figure) -> Figure:
     if labels.tickvals:
         bar = figure.colorbar(grid[0, 0].collections[0], ax=grid, aspect=40, pad=0.02)
         bar.set_ticks(labels.tickvals, labels=labels.ticktext)
+        bar.set_label(_unescape_text(labels.title.text))
     if legend:
         groups = list(dict.fromkeys(group for group, _ in legend))
         figure.legend(

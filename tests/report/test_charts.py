@@ -20,9 +20,10 @@ from gyrostab.jobs.fleet_table import list_effects, make_table, summarise_run
 from gyrostab.noise import LAWS, model_avar
 from gyrostab.plot.style import COLOURS
 from gyrostab.report import write_diagnosis_report, write_report
-from gyrostab.report.diagnosis_charts import diagnosis_charts
+from gyrostab.report.diagnosis_charts import diagnosis_charts, draw_change
 from gyrostab.report.fleet import write_overview
 from gyrostab.report.product_charts import product_charts, window_data
+from gyrostab.report.static import draw_static
 from tests.diagnose.result.test_diagnosis import content, diagnosis, surfaces
 from tests.jobs.test_fleet_table import write_diagnosis
 from tests.support import synthetic
@@ -348,11 +349,23 @@ def test_change_is_the_ratio_of_recording_and_simulation():
     }
 
 
+def test_the_colours_of_the_change_have_a_label_with_unit():
+    drawn = draw_static(draw_change(surfaces(), content()))
+    assert drawn.axes[-1].get_ylabel() == "σ(τ), recording / simulation [1]"
+    assert drawn.axes[-1].get_yticklabels()[0].get_text() == "≤ 0.5"
+
+
 @pytest.mark.slow
 @_needs_browser
-@pytest.mark.parametrize("width", [1280, 400])
-def test_a_browser_draws_the_page_of_a_diagnosis(tmp_path, width):
-    path = write_diagnosis_report(diagnosis(), tmp_path / "report.html")
+@pytest.mark.parametrize(("width", "hours"), [(1280, 1.0), (400, 1.0), (700, 24.0), (400, 24.0)])
+def test_a_browser_draws_the_page_of_a_diagnosis(tmp_path, width, hours):
+    """A record of a day has midnight, and so a date, at both ends of each panel."""
+    made = diagnosis()
+    if hours > 1.0:
+        made.content["recording"]["start"] = "2026-03-14T00:00:00.000Z"
+        for name in ("begin", "end", "block_begin", "block_end"):
+            made.surfaces[name] = made.surfaces[name] * hours
+    path = write_diagnosis_report(made, tmp_path / "report.html")
     state = _browse(path, width)
     _check_access(state, width)
     assert state["drawn"] >= 4
