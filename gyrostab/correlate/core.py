@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -12,7 +14,13 @@ from numpy.typing import NDArray
 
 from gyrostab.correlate.dataset import assemble
 from gyrostab.correlate.drivers import Driver, align_drivers, other_channels
-from gyrostab.correlate.fit import SIGNIFICANCE, fit_driver, fit_partial_effects, make_blocks
+from gyrostab.correlate.fit import (
+    SIGNIFICANCE,
+    Blocks,
+    fit_driver,
+    fit_partial_effects,
+    make_blocks,
+)
 from gyrostab.correlate.judge import VERDICTS, describe_coupling, slope_label
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import TERMS
@@ -21,6 +29,8 @@ from gyrostab.time.durations import duration_seconds
 
 Array = NDArray[np.float64]
 _MAX_LAGS = 48
+#: Share of the samples of a window from which on it is used.
+_MIN_COVERAGE = 0.05
 
 
 def correlate(
@@ -48,7 +58,9 @@ def correlate(
         Channel of the product, or a channel with a separate time coordinate, which is averaged over
         the windows. With several, the rates of change are drivers only if they are named
         (``["temperature", "temperature_rate", "vibration"]``), and the partial effect of each
-        driver is estimated, given the others at their best-fitting lags.
+        driver is estimated, given the others at their best-fitting lags, from the windows in which
+        all are known. A driver that cannot be fitted alone, for instance one without values, is
+        left out of these effects.
     variables : str or sequence of str, optional
         Names with dims ``(axis, time)``; by default ``window_mean`` and every coefficient that is
         observed in at least one window.
@@ -102,34 +114,46 @@ def correlate(
             )
     drivers = align_drivers(product, channels, lags, step)
     other_series = [product[name].values for name in other_channels(product, drivers)]
-    entries: dict[tuple[int, int, int], dict[str, Any]] = {}
-    groups: dict[bytes, list[tuple[int, int]]] = {}
-    masks, lags, drivers = _usable_windows(product, names, lags, drivers)
-    coverage = product["window_coverage"].values
-    for place, mask in masks.items():
-        groups.setdefault(mask.tobytes() + coverage[place[0]].tobytes(), []).append(place)
-    for places in groups.values():
-        blocks = make_blocks(masks[places[0]], time, length, step, coverage[places[0][0]])
-        series = (
-            np.stack([product[names[v]].values[a] for a, v in places], axis=1)[blocks.windows]
-            if blocks
-            else np.empty((0, len(places)))
+    series = {
+        (a, v): _usable_series(product, name, a)
+        for v, name in enumerate(names)
+        for a in range(product.sizes["axis"])
+    }
+    known, counts = _known_windows(drivers, share=len(channels) == 1)
+    coverage = product["window_coverage"].values.astype(np.float64)
+
+    @functools.cache
+    def find_blocks(mask: bytes, share: bytes) -> Blocks | None:
+        return make_blocks(
+            np.frombuffer(mask, dtype=np.bool_), time, length, step, np.frombuffer(share)
         )
-        fitted = [
-            fit_driver(blocks, series, driver, other_series, lags.astype(np.float64) * step, level)
-            for driver in drivers
-        ]
-        if len(channels) > 1:
-            for row, of_series in zip(series.T, zip(*fitted, strict=True), strict=True):
-                fit_partial_effects(blocks, row, drivers, of_series, level)
-        for d, of_driver in enumerate(fitted):
-            entries |= {(*place, d): entry for place, entry in zip(places, of_driver, strict=True)}
+
+    entries: dict[tuple[int, int, int], dict[str, Any]] = {}
+    for d, driver in enumerate(drivers):
+        used = replace(driver, values=driver.values[: counts[d]])
+        lag_times = lags[: counts[d]].astype(np.float64) * step
+        groups: dict[tuple[bytes, bytes], list[tuple[int, int]]] = {}
+        for place, row in series.items():
+            mask = np.isfinite(row) & known[d]
+            groups.setdefault((mask.tobytes(), coverage[place[0]].tobytes()), []).append(place)
+        for key, places in groups.items():
+            rows = np.stack([series[place] for place in places])
+            fitted = fit_driver(find_blocks(*key), rows, used, other_series, lag_times, level)
+            entries |= {(*place, d): entry for place, entry in zip(places, fitted, strict=True)}
+    if len(channels) > 1:
+        _note_empty_drivers(drivers)
+        for (a, v), row in series.items():
+            of_series = [entries[a, v, d] for d in range(len(drivers))]
+            shared = known[["best" in entry for entry in of_series]].all(axis=0)
+            blocks = find_blocks((np.isfinite(row) & shared).tobytes(), coverage[a].tobytes())
+            fit_partial_effects(blocks, row, drivers, of_series, level)
     _adjust_p_values(entries)
     for (a, v, d), entry in entries.items():
         entry["unit_label"] = slope_label(product[names[v]], drivers[d].units)
         series_name = f"{names[v].replace('_', ' ')} of axis {product['axis'].values[a]}"
         entry["statement"] = describe_coupling(entry, drivers[d].label, series_name)
-    return assemble(product, names, drivers, entries, level=level, longest=float(lags[-1] * step))
+    longest = float(lags[counts.max() - 1] * step)
+    return assemble(product, names, drivers, entries, level=level, longest=longest)
 
 
 def _check_windows(product: xr.Dataset) -> None:
@@ -184,27 +208,40 @@ def _choose_lags(max_lag: Any, span: float, step: float) -> NDArray[np.int64]:
     )
 
 
-def _usable_windows(
-    product: xr.Dataset, names: list[str], lags: NDArray[np.int64], drivers: list[Driver]
-) -> tuple[dict[tuple[int, int], NDArray[np.bool_]], NDArray[np.int64], list[Driver]]:
-    """Find the windows of each (axis, variable) in which series and driver are known at every lag.
+def _usable_series(product: xr.Dataset, name: str, axis: int) -> Array:
+    """Return a variable by window, NaN where it is not observed or almost no sample is present."""
+    part = product.isel(axis=axis)
+    good = part["window_coverage"].values > _MIN_COVERAGE
+    if name in TERMS:
+        good &= part["observable"].sel(term=name).values == OBSERVED
+    return np.where(good, part[name].values, np.nan)
 
-    Lags that would cost more than a third of the windows are left out.
+
+def _known_windows(
+    drivers: list[Driver], *, share: bool
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Find the windows in which each driver is known at every lag, and its number of lags.
+
+    Lags that would cost more than a third of the windows are left out. A channel and its rate of
+    change `share` their windows.
     """
-    is_known = np.logical_and.accumulate(
-        np.all([np.isfinite(driver.values) for driver in drivers], axis=0), axis=0
-    )
-    last_lag = int(np.flatnonzero(is_known.sum(axis=1) >= 2 / 3 * is_known[0].sum())[-1])
-    lags = lags[: last_lag + 1]
-    drivers = [replace(driver, values=driver.values[: last_lag + 1]) for driver in drivers]
-    masks = {}
-    for v, name in enumerate(names):
-        good = np.isfinite(product[name].values) & (product["window_coverage"].values > 0.05)
-        if name in TERMS:
-            good &= product["observable"].sel(term=name).values == OBSERVED
-        for a in range(product.sizes["axis"]):
-            masks[a, v] = good[a] & is_known[last_lag]
-    return masks, lags, drivers
+    is_known = np.logical_and.accumulate([np.isfinite(driver.values) for driver in drivers], axis=1)
+    if share:
+        is_known[:] = is_known.all(axis=0)
+    windows = is_known.sum(axis=2)
+    counts = np.array([np.flatnonzero(row >= 2 / 3 * row[0])[-1] + 1 for row in windows])
+    return is_known[np.arange(len(drivers)), counts - 1], counts
+
+
+def _note_empty_drivers(drivers: list[Driver]) -> None:
+    """Warn of drivers that have no value, which the effects of the others cannot be given."""
+    for driver in drivers:
+        if not np.isfinite(driver.values).any():
+            warnings.warn(
+                f"{driver.label} has no value in any window, so it is left out: the effects of the "
+                "other drivers are estimated without it",
+                stacklevel=3,
+            )
 
 
 def _adjust_p_values(entries: dict[tuple[int, int, int], dict[str, Any]]) -> None:

@@ -99,12 +99,12 @@ def fit_driver(
     lags: Array,
     level: float,
 ) -> list[dict[str, Any]]:
-    """Fit one driver to series that share their windows, with one entry per series."""
+    """Fit one driver to series (rows) that share their windows, with one entry per series."""
     if blocks is None:
         reason = "too_few" if np.isfinite(driver.values).any() else "no_values"
-        return [_empty_entry({reason}) for _ in range(series.shape[1])]
+        return [_empty_entry({reason}) for _ in series]
     x = np.asarray(blocks.average @ driver.values[:, blocks.windows].T)
-    y = np.asarray(blocks.average @ series)
+    y = np.asarray(blocks.average @ series[:, blocks.windows].T)
     limits = driver_limits(x[:, 0], blocks.pieces, driver.units, derived=driver.derived)
     timed = np.concatenate([blocks.offsets, blocks.trend], axis=1)
     nuisance = blocks.offsets if "no_reversal" in limits else timed
@@ -114,7 +114,7 @@ def fit_driver(
         elif _largest_leverage(x[:, 0], nuisance) > _MAX_LEVERAGE:
             limits = limits | {"one_moment"}
     if limits & {"constant", "too_few", "one_moment"}:
-        return [_empty_entry(limits, windows=blocks.windows.size) for _ in range(series.shape[1])]
+        return [_empty_entry(limits, windows=blocks.windows.size) for _ in series]
     other_series = [
         np.asarray(blocks.average @ row[blocks.windows])
         for row in other_series
@@ -166,18 +166,21 @@ def fit_driver(
 
 def fit_partial_effects(
     blocks: Blocks | None,
-    row: Array,
+    series: Array,
     drivers: list[Driver],
     entries: Sequence[dict[str, Any]],
     level: float,
 ) -> None:
-    """Fit one series on every driver, given the others at their best-fitting lags."""
+    """Fit one series on every driver, given the others at their best-fitting lags.
+
+    Drivers without a fit of one driver alone are left out.
+    """
     for entry in entries:
         entry |= dict.fromkeys(_PARTIAL.values(), np.nan)
     fitted = [d for d, entry in enumerate(entries) if "best" in entry]
     if blocks is None:
         return
-    y = np.asarray(blocks.average @ row)
+    y = np.asarray(blocks.average @ series[blocks.windows])
     columns = {
         d: np.asarray(blocks.average @ drivers[d].values[entries[d]["best"], blocks.windows])
         for d in fitted

@@ -133,6 +133,47 @@ def test_partial_effects_separate_two_drivers_that_move_together():
     assert "given the other drivers" in format_correlation(correlation)
 
 
+def test_a_driver_without_some_values_takes_no_windows_from_the_others():
+    product = shaken_product(slope=0.3)
+    options = {
+        "variables": "window_mean",
+        "max_lag": "5min",
+        "channel": ["temperature", "vibration"],
+    }
+    complete = gyrostab.correlate(product, **options)
+    first_part = product.isel(time=slice(2 * product.sizes["time"] // 3))
+    part = product.assign(
+        vibration=product["vibration"].where(product["time"].isin(first_part.time))
+    )
+    correlation = gyrostab.correlate(part, **options)
+    warm = {"driver": "temperature"}
+    for name in ("windows_used", "coupling_lag", "p_value", "correlation"):
+        np.testing.assert_array_equal(correlation[name].sel(warm), complete[name].sel(warm))
+    name = "window_mean_per_temperature_stderr"
+    np.testing.assert_array_equal(correlation[name], complete[name])
+    used = correlation["windows_used"].sel(axis="x", driver="vibration")
+    assert 0 < used.item() <= first_part.sizes["time"]
+    known = {**options, "max_lag": 0}
+    of_part, of_first = (gyrostab.correlate(data, **known) for data in (part, first_part))
+    for name in ("window_mean_per_temperature_partial", "window_mean_per_vibration_partial_low"):
+        np.testing.assert_array_equal(of_part[name], of_first[name])
+
+
+def test_a_driver_without_any_value_is_named_and_left_out():
+    product = shaken_product(slope=0.3)
+    options = {"variables": "window_mean", "max_lag": 0}
+    names = ["temperature", "vibration"]
+    expected = gyrostab.correlate(product, channel=names, **options)
+    product["pressure"] = product["vibration"].copy(data=np.full(product.sizes["time"], np.nan))
+    product["pressure"].attrs["units"] = "Pa"
+    with pytest.warns(UserWarning, match="pressure has no value in any window, so it is left out"):
+        correlation = gyrostab.correlate(product, channel=[*names, "pressure"], **options)
+    for name in ("window_mean_per_temperature_partial", "window_mean_per_vibration_low"):
+        np.testing.assert_array_equal(correlation[name], expected[name])
+    assert set(correlation["coupling_verdict"].sel(driver="pressure").values.ravel()) == {0}
+    assert "pressure has no value" in str(correlation["statement"].sel(driver="pressure").values)
+
+
 def test_rate_of_change_is_a_driver_only_if_it_is_named_with_others():
     product = shaken_product().drop_vars("temperature_rate")
     correlation = gyrostab.correlate(
