@@ -21,6 +21,7 @@ from gyrostab.errors import (
     UnitError,
 )
 from gyrostab.ingest.dataframe import from_dataframe, keyword_advice, warn_notes
+from gyrostab.ingest.make_log import hide_infinite
 from gyrostab.ingest.uniform import advise_dates, as_uniform
 from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS
 from gyrostab.store.private import is_in_memory
@@ -53,7 +54,9 @@ def as_log(data: Any) -> xr.Dataset:
     """
     if isinstance(data, xr.DataArray):
         with _advise_conversion("gyrostab.from_dataarray(da, ...)"):
-            return as_uniform(_dataset_of(data, None, None)[0])
+            log = as_uniform(_dataset_of(data, None, None)[0])
+        warn_notes(log)
+        return log
     if isinstance(data, pd.DataFrame | pd.Series):
         with _advise_conversion("gyrostab.from_dataframe(df, ...)"):
             return from_dataframe(data)
@@ -100,8 +103,8 @@ def from_dataarray(
     ----------
     da : xarray.DataArray
         On ``time`` or on ``axis`` and ``time`` in any order, with a datetime64 coordinate ``time``
-        that does not run backwards. Samples may be missing. A lazy array on a uniform time axis
-        stays lazy.
+        that does not run backwards. Samples may be missing; infinite values become NaN. A lazy
+        array on a uniform time axis stays lazy.
     units : str, optional
         Unit of the values; ``da.attrs["units"]`` by default.
     kind : {"rate", "angle"}, optional
@@ -154,7 +157,7 @@ def from_dataarray(
             regular_log = regularise(
                 raw.assign_attrs(source_files=["DataArray"]), rate=rate, max_gap=max_gap
             )
-        warn_notes(regular_log)
+    warn_notes(regular_log)
     if rate is not None and abs(rate / regular_log.attrs["sampling_rate_hz"] - 1) > 1e-6:
         raise TimeError(
             f"rate={rate:g} Hz, but the time of the DataArray says "
@@ -213,18 +216,24 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
         )
     array = da if "axis" in da.dims else da.drop_vars("axis", errors="ignore").expand_dims("axis")
     signal = array.variable.transpose("axis", "time")
-    data = signal.data * unit.factor if unit.factor != 1.0 else signal.data
+    values = hide_infinite(signal.data)
+    data = values * unit.factor if unit.factor != 1.0 else values
     packing = (
         declare_counts(signal.dtype, unit.factor)
         if signal.dtype.kind in "iu" and not increments
         else {}
     )
     attrs = {"long_name": SIGNAL_LONG_NAMES[name], **da.attrs, "units": SIGNAL_UNITS[name]}
+    log_attrs: dict[str, Any] = {"kind": name}
+    if isinstance(values, np.ndarray) and values is not signal.data:
+        count = int(np.isinf(signal.data).sum())
+        log_attrs["unreadable_cells"] = count
+        log_attrs["notes"] = [f"DataArray: {count} gyro cells are infinite and become NaN"]
     bare = array.coords.to_dataset().drop_vars(
         [coord for coord in array.coords if coord not in ("time", "axis")]
     )
     log = bare.assign({name: (("axis", "time"), data, attrs, packing)})
-    return log.assign_coords(axis=axes).assign_attrs(kind=name), increments
+    return log.assign_coords(axis=axes).assign_attrs(log_attrs), increments
 
 
 def _unit_of(da: xr.DataArray, units: str | None) -> Unit:

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 
+import gyrostab
 from gyrostab.errors import MissingUnitError, OptionError, UnitError
 from gyrostab.ingest.make_log import make_log
 
@@ -83,3 +84,36 @@ def test_channels_have_the_units_of_channels_of_files():
         "temperature_case": (1.0, "V"),
         "ramp": (1.0, "V"),
     }
+
+
+@pytest.mark.parametrize("missing", [[], [11]], ids=["uniform", "gap"])
+@pytest.mark.parametrize("make", ["from_dataarray", "from_dataframe", "davar", "lazy"])
+def test_infinite_values_of_labelled_data_are_missing_and_counted(make, missing):
+    values, temperature = np.arange(400.0) % 7, 20.0 + np.arange(400.0) / 100
+    values[[5, 6, 200]] = np.inf, np.inf, -np.inf
+    temperature[8] = np.inf
+    time = pd.date_range("2026-01-01", periods=400, freq="10ms")
+    kept = np.setdiff1d(np.arange(400), missing)
+    array = xr.DataArray(values, {"time": time}, attrs={"units": "deg/s"})[kept]
+    expected = np.where(np.isinf(values), np.nan, values) * 3600.0
+    expected[missing] = np.nan
+    if make == "lazy":
+        for lazy in (array.chunk(time=150), array.chunk(time=-1)):
+            log = gyrostab.from_dataarray(lazy)
+            assert log.rate.chunks is not None or missing
+            np.testing.assert_array_equal(log.rate.values[0], expected)
+        return
+    if make == "davar":
+        with pytest.warns(UserWarning, match="3 gyro cells are infinite"):
+            surface = gyrostab.davar(array, window="1s")
+        assert_same = np.testing.assert_array_equal
+        log = make_log(expected, rate=100.0, unit="deg/h", start="2026-01-01")
+        assert_same(surface.avar.values, gyrostab.davar(log, window="1s").avar.values)
+        return
+    columns = {"gyro_x [deg/s]": values, "temperature [degC]": temperature}
+    given = array if make == "from_dataarray" else pd.DataFrame(columns, time).iloc[kept]
+    with pytest.warns(UserWarning, match="3 gyro cells"):
+        log = getattr(gyrostab, make)(given)
+    np.testing.assert_array_equal(log.rate.values[0], expected)
+    assert log.attrs["unreadable_cells"] == (3 if make == "from_dataarray" else 4)
+    assert not any(np.isinf(item.values).any() for item in log.values() if item.dtype.kind == "f")

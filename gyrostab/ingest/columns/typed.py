@@ -105,7 +105,8 @@ def read_batches(
         columns, values, words = take(batch), {}, 0
         for column in [*builder.gyro, *builder.channels]:
             values[column.source], not_numbers = _to_floats(columns[column.source])
-            words += not_numbers if column.role == "channel" else 0
+            if column.role == "channel":
+                words += not_numbers + int(np.isinf(values[column.source]).sum())
         time = builder.time
         stamps = None if time is None else to_stamps(columns[time.source], time)
         return builder.prepare(values, stamps, words=words)
