@@ -282,7 +282,7 @@ def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]
         for term in hidden
         if term in limits and np.isfinite(white) and is_allan
     ]
-    text += f": use --window {format_duration(longer[-1])}"
+    text += f": use a window (--window) of {format_duration(longer[-1])}"
     return text + (f", which observes {join_words(sizes)}." if sizes else ".")
 
 

@@ -303,13 +303,13 @@ def _describe_misfit(product: xr.Dataset) -> list[str]:
         line = f"The terms do not describe {', '.join(failing)}; no term counts as observed there"
         start = find_fit_from(product)
         if start:
-            remedy = f"they do from {start:g} s on: fit again with --fit-from {start:g}s"
+            remedy = f"they do from {start:g} s on: fit again with tau_min (--fit-from) {start:g}s"
         elif not any(fit.fails for fit in summarise_fit(_without_outliers(product))):
-            remedy = "these windows hold outliers, which no --fit-from removes"
+            remedy = "these windows hold outliers, which no tau_min (--fit-from) removes"
         else:
             remedy = (
-                "no --fit-from changes that: look for spectral lines, vibration or motion in the "
-                "record"
+                "no tau_min (--fit-from) changes that: look for spectral lines, vibration or "
+                "motion in the record"
             )
         lines.append(f"{line}; {remedy}.")
     return lines
@@ -385,6 +385,6 @@ def _describe_motion(product: xr.Dataset) -> list[str]:
         return []
     return [
         "The mean rate departs from its median by more than twice the Earth rate: "
-        f"{', '.join(moved)}. The cause is motion or a drifting bias; leave out such times with "
-        "--exclude."
+        f"{', '.join(moved)}. The cause is motion or a drifting bias; leave out such times "
+        "(--exclude, or log.sel(time=...))."
     ]

@@ -173,7 +173,7 @@ def to_kalibr(
         "# Kalibr also asks for rostopic."
         if log is not None
         else "# Kalibr also asks for rostopic, accelerometer_noise_density and "
-        "accelerometer_random_walk: give the log too (--log) if it has accelerations.",
+        "accelerometer_random_walk: give the log too, as log (--log), if it has accelerations.",
         *(_describe_fit(fit) for fit in summarise_fit(product)),
         f"update_rate: {float(rate)!r}  # Hz",
     ]
@@ -206,7 +206,7 @@ def _describe_fit(fit: FitSummary) -> str:
     if fit.fails:
         text += (
             f"; the noise terms do NOT describe {100 * fit.failing_share:.0f} % of them: "
-            "fit again with a longer --fit-from"
+            "fit again from a longer averaging time, tau_min (--fit-from)"
         )
     return text
 
@@ -226,7 +226,7 @@ def _format_entry(key: str, term: TermSummary, *, indent: str) -> list[str]:
         "upper_limit_only": f"{unit}; 95 % UPPER LIMIT of {symbol} ({name}), "
         f"in {100 * term.limited_share:.0f} % of the windows",
         "not_observable": f"{unit}; not observable in any window: "
-        f"a longer --window may show {symbol} ({name})",
+        f"a longer window (--window) may show {symbol} ({name})",
     }[term.status]
     number = "null" if math.isnan(term.value) else f"{term.value:.6e}"
     return [f"{indent}{key}: {number}  # {comment}", f"{indent}{key}_meaning: {term.status}"]

@@ -101,7 +101,7 @@ def to_iscwsa(
         if running_speed is None and model.tool == "z":
             raise OptionError(
                 "a tool with a z gyro alone surveys continuously; give its speed along the hole in "
-                "m/s with --running-speed"
+                "m/s as running_speed (--running-speed)"
             )
         make = {".json": _make_json, ".xml": _make_witsml}[path.suffix.lower()]
         text = make(model, path.stem, running_speed, continuous_from)
@@ -113,10 +113,13 @@ def to_iscwsa(
 def _check_course(running_speed: float | None, continuous_from: float) -> None:
     if not 0.0 <= continuous_from <= 90.0:  # false for nan too
         raise OptionError(
-            f"--continuous-from {continuous_from!r} is not an inclination from 0 to 90 degrees"
+            f"continuous_from (--continuous-from) {continuous_from!r} is not an inclination from "
+            "0 to 90 degrees"
         )
     if running_speed is not None and not 0.0 < running_speed < math.inf:
-        raise OptionError(f"--running-speed {running_speed!r} is not a speed above zero, in m/s")
+        raise OptionError(
+            f"running_speed (--running-speed) {running_speed!r} is not a speed above zero, in m/s"
+        )
 
 
 def _make_table(model: SurveyModel) -> str:

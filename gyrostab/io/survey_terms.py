@@ -200,11 +200,13 @@ def survey_terms(
     ('GXY-RN', '0.04 deg/h')
     """
     if statistic not in ("median", "p95"):
-        raise OptionError(f"--statistic {statistic!r} is neither median nor p95")
+        raise OptionError(f"statistic (--statistic) {statistic!r} is neither median nor p95")
     times = {
-        "station": duration_seconds(station_time, "--station-time"),
-        "section": duration_seconds(section_time, "--section-time"),
-        "calibration": duration_seconds(calibration_time or station_time, "--calibration-time"),
+        "station": duration_seconds(station_time, "station_time (--station-time)"),
+        "section": duration_seconds(section_time, "section_time (--section-time)"),
+        "calibration": duration_seconds(
+            calibration_time or station_time, "calibration_time (--calibration-time)"
+        ),
     }
     content = getattr(diagnosis, "content", diagnosis)
     if not (content is None or isinstance(content, Mapping)):
@@ -226,11 +228,12 @@ def survey_terms(
         if constant:
             raise SchemaError(
                 f"axis {', '.join(constant)} is constant: its sensor is dead, or its column the "
-                "wrong one; make the product again without it (--axis names the axes to analyse)"
+                "wrong one; make the product again without it (--axis, or log.sel(axis=[...]))"
             )
         raise SchemaError(
             f"no window of the product observes or limits N of axis {', '.join(silent)}; make the "
-            "product again with a longer --window, or without that axis (--axis)"
+            "product again with a longer window (--window), or without that axis (--axis, or "
+            "log.sel(axis=[...]))"
         )
     return SurveyModel(
         tool,
@@ -270,8 +273,8 @@ def _find_tool(axes: Sequence[str]) -> Tool:
     if strange := sorted(set(axes) - set("xyz")):
         raise SchemaError(
             f"the product has axes named {', '.join(strange)}; survey terms need the axes x and y "
-            "across the tool and z along it: name them with --map when reading the log, or with "
-            "product.assign_coords(axis=[...])"
+            "across the tool and z along it: name them with map (--map) when reading the log, or "
+            "with product.assign_coords(axis=[...])"
         )
     if "z" not in axes:
         return "xy"
@@ -387,8 +390,8 @@ def _make_notes(
         )
     if missing := [term.code for term in terms if math.isnan(term.value)]:
         notes.append(
-            f"Not observable and not exported: {', '.join(missing)}; a longer --window may show "
-            "B and K."
+            f"Not observable and not exported: {', '.join(missing)}; a longer window (--window) "
+            "may show B and K."
         )
     if failing := [fit.axis for fit in summarise_fit(product) if fit.fails]:
         notes.append(f"The noise terms do not describe all windows of {', '.join(failing)}.")

@@ -69,7 +69,7 @@ def test_a_term_that_one_state_hides_is_named():
 def test_unobserved_terms_come_with_a_longer_window_or_a_longer_record():
     product = _make_product({"B": UPPER_LIMIT_ONLY, "K": NOT_OBSERVABLE})
     text = judge_product(product)[1]
-    assert text.startswith("B and K are not observed in windows of 6s: use --window ")
+    assert text.startswith("B and K are not observed in windows of 6s: use a window (--window) of ")
     assert "only a longer record" in judge_product(product.isel(time=slice(0, 4)))[1]
     assert "sampling rate" in judge_product(_make_product({"Q": UPPER_LIMIT_ONLY}))[1]
 

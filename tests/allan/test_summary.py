@@ -68,7 +68,7 @@ def test_fit_from_the_proposed_averaging_time_describes_the_record():
     start = find_fit_from(product)
     assert 0.05 < start < 1.0
     text = format_product(product)
-    assert f"--fit-from {start:.3g}s" in text
+    assert f"fit again with tau_min (--fit-from) {start:.3g}s" in text
     refitted = gyrostab.fit_noise(product, tau_min=start)
     assert not summarise_fit(refitted)[0].fails
     # 1.005: the boxcar leaves the noise at averaging times of ten filter lengths and more as it was
@@ -119,7 +119,7 @@ def test_outliers_get_no_advice_on_the_averaging_times():
     values = white(120_000, 7)
     values[np.random.default_rng(3).choice(120_000, 40, replace=False)] += 500.0
     text = "\n".join(describe_record(make_product(values, window="2min")))
-    assert "these windows hold outliers, which no --fit-from removes" in text
+    assert "these windows hold outliers, which no tau_min (--fit-from) removes" in text
     assert "fit again" not in text
 
 
