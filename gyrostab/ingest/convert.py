@@ -21,9 +21,9 @@ from gyrostab.errors import (
     UnitError,
 )
 from gyrostab.ingest.dataframe import from_dataframe, keyword_advice, warn_notes
-from gyrostab.ingest.make_log import hide_infinite
 from gyrostab.ingest.uniform import advise_dates, as_uniform
 from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS
+from gyrostab.store.lazy import hide_infinite
 from gyrostab.store.private import is_in_memory
 from gyrostab.store.read import MIN_LAZY_VALUES, make_variable_lazy
 from gyrostab.store.write import declare_counts

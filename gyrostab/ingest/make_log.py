@@ -17,7 +17,7 @@ from gyrostab.ingest.columns.headers import (
     unit_quantity,
 )
 from gyrostab.schema import RESERVED_NAMES, SIGNAL_LONG_NAMES, SIGNAL_UNITS
-from gyrostab.store.lazy import Converted, find_source, make_dask
+from gyrostab.store.lazy import hide_infinite
 from gyrostab.store.write import declare_counts
 from gyrostab.time.grid import check_rate, check_span, time_coordinate
 from gyrostab.time.stamps import stamp_ns
@@ -116,18 +116,6 @@ def _real_numbers(values: Any, label: str) -> Any:
             f"{label} are of type {data.dtype}; give real numbers, and NaN where one is missing"
         )
     return hide_infinite(data)
-
-
-def hide_infinite(values: Any) -> Any:
-    """Return numbers with NaN in the place of infinite ones, in dask if they are."""
-    if values.dtype.kind != "f":
-        return values
-    if find_source(values) is not None:
-        return make_dask(Converted(values, hide_infinite, values.dtype), values.chunks)
-    if isinstance(values, da.Array):
-        return values.map_blocks(hide_infinite, dtype=values.dtype)
-    infinite = np.isinf(values)
-    return np.where(infinite, values.dtype.type(np.nan), values) if infinite.any() else values
 
 
 def _channel_variable(name: str, channel: Any, size: int) -> xr.Variable:

@@ -228,6 +228,18 @@ class Converted(Source):
         return self.convert(read_box(self.parts[0], box if isinstance(box, tuple) else (box,)))
 
 
+def hide_infinite(array: Any) -> Any:
+    """Return an array with NaN in the place of infinite values, lazy if it is."""
+    if array.dtype.kind != "f":
+        return array
+    if find_source(array) is not None:
+        return make_dask(Converted(array, hide_infinite, array.dtype), array.chunks)
+    if hasattr(array, "dask"):
+        return array.map_blocks(hide_infinite, dtype=array.dtype)
+    infinite = np.isinf(array)
+    return np.where(infinite, array.dtype.type(np.nan), array) if infinite.any() else array
+
+
 class _Joined(RowSource):
     """Columns one after the other."""
 
