@@ -53,7 +53,7 @@ def check_update(
         other options.
     """
     listed = {full_name(path) for path in [*archive.files, *archive.diagnoses]}
-    known_names = [] if known_table is None else known_table["file"]
+    known_names: Any = [] if known_table is None else known_table["file"]
     other = next((name for name in known_names if name not in listed and _exists(name)), None)
     plain = json.loads(json.dumps(options, default=str))
     same: dict[str, Any] = {"inputs": [], "versions": {}}
