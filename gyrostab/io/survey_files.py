@@ -32,7 +32,8 @@ import xarray as xr
 
 from gyrostab.errors import OptionError
 from gyrostab.io.survey_model import SurveyModel, SurveyTerm
-from gyrostab.io.survey_terms import TABLES, survey_terms
+from gyrostab.io.survey_tables import TABLES
+from gyrostab.io.survey_terms import survey_terms
 from gyrostab.store.output import check_output, new_output
 from gyrostab.units import HOUR
 

@@ -37,6 +37,7 @@ import xarray as xr
 from gyrostab.allan.summary import TermSummary, summarise_fit, summarise_terms
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.io.survey_model import Status, SurveyModel, SurveyTerm, Tool
+from gyrostab.io.survey_tables import KINDS, TABLES, Groups
 from gyrostab.noise import LAWS
 from gyrostab.schema import texts
 from gyrostab.time.durations import duration_seconds
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
     from gyrostab.diagnose.result.diagnosis import Diagnosis
 
 Statistic = Literal["median", "p95"]
-_Groups = tuple[tuple[str, ...], ...]
 #: From best to worst: a term has the worst status of its coefficients.
 _STATUSES = ("observed", "upper_limit_only", "not_observable")
 _CONFIRM = (
@@ -65,61 +65,6 @@ class _Magnitude(NamedTuple):
 
 #: Largest Allan deviation of a constant axis, over its mean: rounding errors.
 _ROUNDING = 1e-9
-
-# Groups of axes, or of pairs of a gyro axis and an axis of acceleration.
-_XY: _Groups = (("x", "y"),)
-_Z: _Groups = (("z",),)
-_AXIAL: _Groups = (("xz", "yz"),)
-
-# fmt: off
-_H = "(EarthRate * Cos(Latitude))"
-_STEP = "(MD - MDPrev) / "
-_MEAN = "((Inc + IncPrev) / 2)"
-#: Tool -> rows of code, kind, groups, and weighting function of the azimuth in the notation of
-#: ISCWSA. Tables 3 and 6, 4 and 7, and 8 of the reference.
-TABLES: dict[Tool, tuple[tuple[str, str, _Groups, str], ...]] = {
-    "xyz": (
-        ("GXYZ-XYRN", "noise", _XY, f"Sqr(1 - Sin(AzT) ^ 2 * Sin(Inc) ^ 2) / {_H}"),
-        ("GXYZ-XYB1", "bias", _XY, f"Sin(AzT) * Cos(Inc) / {_H}"),
-        ("GXYZ-XYB2", "bias", _XY, f"Cos(AzT) / {_H}"),
-        ("GXYZ-XYG1", "g", (("xy", "yx"),), f"Cos(AzT) * Sin(Inc) / {_H}"),
-        ("GXYZ-XYG2", "g", _AXIAL, f"Cos(AzT) * Cos(Inc) / {_H}"),
-        ("GXYZ-XYG3", "g", _AXIAL, f"Sin(AzT) * Cos(Inc) ^ 2 / {_H}"),
-        ("GXYZ-XYG4", "g", (("xx", "yy"),), f"Sin(AzT) * Sin(Inc) * Cos(Inc) / {_H}"),
-        ("GXYZ-ZRN", "noise", _Z, f"Sin(AzT) * Sin(Inc) / {_H}"),
-        ("GXYZ-ZB", "bias", _Z, f"Sin(AzT) * Sin(Inc) / {_H}"),
-        ("GXYZ-ZG1", "g", (("zx", "zy"),), f"Sin(AzT) * Sin(Inc) ^ 2 / {_H}"),
-        ("GXYZ-ZG2", "g", (("zz",),), f"Sin(AzT) * Sin(Inc) * Cos(Inc) / {_H}"),
-        ("GXYZ-GD", "drift", _XY + _Z, f"XYZ_Gyro_Drift + {_STEP}GXYRunningSpeed"),
-        ("GXYZ-GRW", "walk", _XY + _Z, f"Sqr(XYZ_Gyro_Random_Walk ^ 2 + {_STEP}GXYRunningSpeed)"),
-    ),
-    "xy": (
-        ("GXY-RN", "noise", _XY, f"Sqr(1 - Cos(AzT) ^ 2 * Sin(Inc) ^ 2) / ({_H} * Cos(Inc))"),
-        ("GXY-B1", "bias", _XY, f"Sin(AzT) / ({_H} * Cos(Inc))"),
-        ("GXY-B2", "bias", _XY, f"Cos(AzT) / {_H}"),
-        ("GXY-G1", "g", (("xy", "yx"),), f"Cos(AzT) * Sin(Inc) / {_H}"),
-        ("GXY-G2", "g", _AXIAL, f"Cos(AzT) * Cos(Inc) / {_H}"),
-        ("GXY-G3", "g", _AXIAL, f"Sin(AzT) / {_H}"),
-        ("GXY-G4", "g", (("xx", "yy"),), f"Sin(AzT) * Tan(Inc) / {_H}"),
-        ("GXY-GD", "drift", _XY, f"XY_Gyro_Drift + {_STEP}(GXYRunningSpeed * Sin{_MEAN})"),
-        ("GXY-GRW", "walk", _XY,
-         f"Sqr(XY_Gyro_Random_Walk ^ 2 + {_STEP}(GXYRunningSpeed * Sin{_MEAN} ^ 2))"),
-    ),
-    "z": (
-        ("GZ-GD", "drift", _Z, f"Z_Gyro_Drift + {_STEP}(GXYRunningSpeed * Cos{_MEAN})"),
-        ("GZ-GRW", "walk", _Z,
-         f"Sqr(Z_Gyro_Random_Walk ^ 2 + {_STEP}(GXYRunningSpeed * Cos{_MEAN} ^ 2))"),
-    ),
-}
-#: Kind -> mode, propagation, unit, derivation.
-_KINDS = {
-    "noise": ("stationary", "Random", "deg/h", "N / sqrt(station time)"),
-    "bias": ("stationary", "Systematic", "deg/h", "N, B, K since the calibration"),
-    "g": ("stationary", "Systematic", "deg/h/g", "g_sensitivity"),
-    "drift": ("continuous", "Systematic", "deg/h", "N, B, K since the calibration"),
-    "walk": ("continuous", "Systematic", "deg/sqrt(h)", "N"),
-}
-# fmt: on
 
 
 def drift_rate(n: float, b: float, k: float, *, section: float, calibration: float) -> float:
@@ -251,7 +196,7 @@ def _is_constant(part: xr.Dataset) -> bool:
 
 
 def _make_term(
-    code: str, kind: str, groups: _Groups, magnitudes: Mapping[str, _Magnitude]
+    code: str, kind: str, groups: Groups, magnitudes: Mapping[str, _Magnitude]
 ) -> SurveyTerm:
     """Take the root mean square in each group, the largest of the groups, and the worst status."""
     known_groups = [[name for name in group if name in magnitudes] for group in groups]
@@ -261,7 +206,7 @@ def _make_term(
         for group in known_groups
         if group
     ]
-    mode, propagation, unit, derivation = _KINDS[kind]
+    mode, propagation, unit, derivation = KINDS[kind]
     value, low, high = map(float, np.max(means, axis=0))
     status = _find_worst(magnitudes[name] for name in names)
     derivation = f"{derivation}; {', '.join(names)}"
