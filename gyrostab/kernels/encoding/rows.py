@@ -8,13 +8,11 @@ nanoseconds.
 
 from __future__ import annotations
 
-from fractions import Fraction
-
 import numpy as np
 from numba import njit, types
-from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER, KERNEL
+from gyrostab.kernels.encoding.decimals import read_decimal, read_digits, read_number
 
 #: What a column holds.
 SKIPPED, NUMBER, NUMERIC_TIME, YEAR_FIRST, DAY_FIRST, MONTH_FIRST = range(6)
@@ -23,26 +21,13 @@ BLANKS = 32
 
 _NAT = np.iinfo(np.int64).min
 _TAB, _LINE, _RETURN, _BLANK, _QUOTE, _HASH, _PERCENT = b'\t\n\r "#%'
-_PLUS, _MINUS, _POINT, _ZERO, _COLON, _T, _Z, _SMALL_E, _SMALL_N, _SLASH, _COMMA = b"+-.0:TZen/,"
+_PLUS, _MINUS, _POINT, _ZERO, _COLON, _T, _Z, _SMALL_N, _SLASH, _COMMA = b"+-.0:TZn/,"
 # words for missing values, in lower case
 _NAN, _NA, _N_A, _NULL, _NONE = (
     int.from_bytes(word, "big") for word in (b"nan", b"na", b"n/a", b"null", b"none")
 )
-_DIGITS = 19  # that surely fit into 64 bits
-_EXACT = np.uint64(1) << np.uint64(53)
-_TENS = 10.0 ** np.arange(23)
 _WHOLE_TENS = np.array([10**n for n in range(20)], dtype=np.uint64)
-_LEAST, _MOST = -60, 40
 _LONGEST_NS = np.uint64(2**63 - 1)
-
-
-def _powers_of_ten() -> NDArray[np.float64]:
-    """Compute the powers of ten from `_LEAST` to `_MOST`, each as a sum of two doubles."""
-    exact = [Fraction(10) ** power for power in range(_LEAST, _MOST + 1)]
-    return np.array([(float(ten), float(ten - Fraction(float(ten)))) for ten in exact])
-
-
-_POWERS = _powers_of_ten()
 
 
 @njit(types.CPointer(types.uint8)(types.CPointer(types.uint8)), **KERNEL)
@@ -52,96 +37,9 @@ def _as_pointer(text):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _split_double(value):  # type: ignore[no-untyped-def]
-    """Split a double into two of 26 bits, so that products of parts are exact."""
-    scaled = value * (2.0**27 + 1.0)
-    high = scaled - (scaled - value)
-    return high, value - high
-
-
-@njit(**INNER)
-def _nearest_double(mantissa, power):  # type: ignore[no-untyped-def]
-    """Find the double nearest to ``mantissa * 10**power``, unless it is nearly between two.
-
-    The product of Dekker, Numerische Mathematik 18 (1971), with twice the digits of a double.
-    """
-    if mantissa == np.uint64(0):
-        return 0.0, True
-    if power < _LEAST or power > _MOST:
-        return 0.0, False
-    value = np.float64(mantissa)
-    if mantissa <= _EXACT and abs(power) < len(_TENS):
-        return (value / _TENS[-power], True) if power < 0 else (value * _TENS[power], True)
-    rest = np.float64(np.int64(mantissa - np.uint64(value)))
-    ten, ten_rest = _POWERS[power - _LEAST]
-    product = value * ten
-    (a, b), (c, d) = _split_double(value), _split_double(ten)
-    low = ((a * c - product) + a * d + b * c) + b * d + (value * ten_rest + rest * ten)
-    nearest = product + low
-    left = low - (nearest - product)
-    doubt = abs(nearest) * 2.0**-98
-    is_sure = nearest + (left - doubt) == nearest and nearest + (left + doubt) == nearest
-    return nearest, is_sure
-
-
-@njit(**INNER)
-def _read_digits(text, at, mantissa):  # type: ignore[no-untyped-def]
-    """Continue reading a whole number: value and end."""
-    while True:
-        digit = np.uint8(text[at] - np.uint8(_ZERO))
-        if digit > 9:
-            return mantissa, at
-        mantissa = mantissa * np.uint64(10) + np.uint64(digit)
-        at += 1
-
-
-@njit(**INNER)
-def _read_decimal(text, at, point):  # type: ignore[no-untyped-def]
-    """Read sign, digits, decimals and end; the end is negative without one, or if long."""
-    negative = text[at] == _MINUS
-    at += np.int64(negative) | np.int64(text[at] == _PLUS)
-    first = at
-    mantissa, at = _read_digits(text, at, np.uint64(0))
-    count, decimals = at - first, np.int64(0)
-    if text[at] == point:
-        first_decimal = at + 1
-        mantissa, at = _read_digits(text, first_decimal, mantissa)
-        decimals = at - first_decimal
-        count += decimals
-    if count > _DIGITS:
-        while text[first] == _ZERO or text[first] == point:  # zeros in front do not count
-            count -= text[first] == _ZERO
-            first += 1
-    return (
-        negative,
-        mantissa,
-        decimals,
-        at if 0 < count <= _DIGITS or (count == 0 and decimals > 0) else np.int64(-1),
-    )
-
-
-@njit(**INNER)
-def _read_number(text, at, point):  # type: ignore[no-untyped-def]
-    """Read a number: value and end; the end is negative without a number."""
-    negative, mantissa, decimals, end = _read_decimal(text, at, point)
-    if end < 0:
-        return 0.0, end
-    power = -decimals
-    if text[end] | 32 == _SMALL_E:
-        down = text[end + 1] == _MINUS
-        first = end + 1 + (down or text[end + 1] == _PLUS)
-        exponent, end = _read_digits(text, first, np.uint64(0))
-        if not 0 < end - first < 4:
-            return 0.0, np.int64(-1)
-        power += -np.int64(exponent) if down else np.int64(exponent)
-    value, is_exact = _nearest_double(mantissa, power)
-    return -value if negative else value, end if is_exact else np.int64(-1)
-
-
-@njit(**INNER)
 def _count_of_time(text, at, point, digits):  # type: ignore[no-untyped-def]
     """Read a numeric time as a multiple of ``10**-digits``, rounded half to even, and its end."""
-    negative, mantissa, decimals, end = _read_decimal(text, at, point)
+    negative, mantissa, decimals, end = read_decimal(text, at, point)
     if end < 0 or (digits == 0 and decimals > 0) or decimals - digits > 18:
         return np.int64(0), np.int64(-1)
     if decimals <= digits:
@@ -230,7 +128,7 @@ def _read_date_stamp(text, at, size, order, mark_of_part, between):  # type: ign
         return none
     end, part = at + (19 if has_seconds else 16), np.uint64(0)
     if has_seconds and (text[end] == _POINT or text[end] == mark_of_part):
-        part, stop = _read_digits(text, end + 1, np.uint64(0))
+        part, stop = read_digits(text, end + 1, np.uint64(0))
         length = stop - end - 1
         if not 0 < length <= 9:
             return none
@@ -320,7 +218,7 @@ def _read_cell(text, at, size, role, separator, point, digits, between, may_quot
         end = _past_void(text, at, separator)
     if end < 0:
         if role == NUMBER:
-            value, end = _read_number(text, at, point)
+            value, end = read_number(text, at, point)
         elif role == NUMERIC_TIME:
             stamp, end = _count_of_time(text, at, point, digits)
         else:
