@@ -22,22 +22,21 @@ from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     INCREMENT_PATTERN,
     TEMPERATURE_PATTERN,
-    TIME_PATTERN,
-    is_time_unit,
     is_unit,
     is_unit_of,
 )
-from gyrostab.ingest.columns.stamps import parse_time_unit
+from gyrostab.ingest.guess_time import (
+    TYPICAL_RATE_HZ,
+    guess_time,
+    rises_by_row,
+    unit_seconds,
+)
 from gyrostab.ingest.guess_unit import given_unit, guess_unit, name_unit
 from gyrostab.ingest.inspect import ColumnInspection, FileInspection
 from gyrostab.time.durations import format_duration
-from gyrostab.time.grid import MAX_RATE_HZ
 
 #: Number of a column, in its name.
 _NUMBER = re.compile(r"[0-9]{1,9}\Z")
-#: Typical rate of gyro logs [Hz], and spread [decades].
-TYPICAL_RATE_HZ, RATE_DECADES = 100.0, 1.0
-
 #: Smallest score of a group of columns that is taken for the gyro: one sign in its name, or a unit.
 MIN_SCORE = 1.5
 
@@ -58,24 +57,6 @@ _OTHER = re.compile(
 _DERIVED = re.compile(
     r"est|pred|filt|ref|bias|cal|std|var|noise|err|setpoint|sp_|integral|delta|dt|ramp|theta|incr"
 )
-
-_TIME_WORD = re.compile(r"time|stamp|tow|clock|epoch|elapsed|seconds|(^|[^a-z])t($|[^a-z])|sec$")
-
-_COUNTER_WORD = re.compile(
-    r"count|packet|seq|index|sample|(^|[^a-z])(n|no|nr|id|row|frame)($|[^a-z])"
-)
-
-_TIME_UNIT_PATTERNS = (
-    (r"nanos|(^|[^a-z])ns$|_ns|nsec", "ns"),
-    (r"micros|usec|timeus|(^|[^a-z])us$|_us", "us"),
-    (r"millis|msec|(^|[^a-z])ms$|_ms", "ms"),
-    (r"seconds|(^|[^a-z])s$|_sec$|_s$", "s"),
-)
-_UNITS = ("s", "ms", "us", "ns")
-#: Unix time between 2001 and 2033 is 1 to 2 of these [s].
-_EPOCH_S = 1e9
-#: Unit of the dates of spreadsheets, and their values in the years 1968 to 2119.
-_SERIAL_DAYS, _SERIAL_RANGE = "days since 1899-12-30", (25_000.0, 80_000.0)
 
 
 @dataclass(frozen=True)
@@ -115,7 +96,7 @@ def guess_columns(
     reasons: list[str] = []
     warnings: list[str] = []
     time, time_unit = (
-        (None, None) if inspection.time is not None else _guess_time(inspection, reasons, warnings)
+        (None, None) if inspection.time is not None else guess_time(inspection, reasons, warnings)
     )
     if inspection.date_spans_s:
         spans = sorted(inspection.date_spans_s.items(), key=lambda span: span[1])
@@ -138,14 +119,12 @@ def guess_columns(
             f"{column.key!r} rises from row to row in {column.unit}, which is not a unit of time: "
             "if the log is over depth, export it over time"
             for column in inspection.columns
-            if column.unit and not is_unit(column.unit) and _rises_by_row(column, inspection)
+            if column.unit and not is_unit(column.unit) and rises_by_row(column, inspection)
         ]
     sampling = (
         rate
         or assumed
-        or (
-            1.0 / (time.pace * _unit_seconds(time_unit)) if time is not None else inspection.rate_hz
-        )
+        or (1.0 / (time.pace * unit_seconds(time_unit)) if time is not None else inspection.rate_hz)
     )
     axes = _guess_axes(inspection, time, reasons)
     group = list(axes.values())
@@ -186,86 +165,6 @@ def _compare_spans(span_s: float, other_span_s: float) -> str:
         return "only if most of its stamps are wrong"
     lengths = (format_duration(seconds, " ") for seconds in (other_span_s, span_s))
     return "if the file lasts {}, not {}".format(*lengths)
-
-
-def _unit_seconds(unit: str | None) -> float:
-    """Return the seconds of a unit of time, which is seconds if None.
-
-    Examples
-    --------
-    >>> _unit_seconds("min"), _unit_seconds(None)
-    (60.0, 1.0)
-    """
-    return float(parse_time_unit(unit or "s").ns) / 1e9
-
-
-def _rises_by_row(column: ColumnInspection, inspection: FileInspection) -> bool:
-    """Return whether a column rises from row to row, as time does."""
-    return (
-        column.rows >= max(2, 0.5 * inspection.rows)
-        and column.rising >= 0.5
-        and column.rising + column.held >= 0.95
-        and column.pace * MAX_RATE_HZ >= 1  # else too fast in any unit
-    )
-
-
-def _guess_time(
-    inspection: FileInspection, reasons: list[str], warnings: list[str]
-) -> tuple[ColumnInspection | None, str | None]:
-    best: tuple[float, ColumnInspection, str, str] | None = None
-    for column in inspection.columns:
-        if not _rises_by_row(column, inspection):
-            continue
-        low = column.key.lower()
-        named = bool(TIME_PATTERN.match(low) or _TIME_WORD.search(low))
-        counter = (
-            column.whole
-            and abs(column.pace - 1.0) < 1e-6
-            and abs(column.std - inspection.rows / math.sqrt(12)) < 0.1 * inspection.rows
-        )
-        written = column.unit or "1"
-        has_other_unit = not (is_time_unit(written) or is_unit_of(written, ("number",)))
-        if not named and (counter or has_other_unit or _COUNTER_WORD.search(low)):
-            continue
-        unit, reason = _time_unit(column)
-        score = 2.0 * named + ("name" in reason) - 0.1 * _rate_distance(column, unit)
-        if best is None or score > best[0]:
-            best = score, column, unit, reason
-    if best is None:
-        return None, None
-    _, column, unit, reason = best
-    reasons.append(
-        f"{column.key!r} is the time, as it rises from row to row; in {unit}, by {reason}"
-    )
-    if reason.startswith("the rate"):
-        warnings.append(
-            f'--unit "time={unit}" is an assumption, because of {reason}: if that is not the '
-            "sampling rate, use the true unit instead"
-        )
-    return column, unit
-
-
-def _time_unit(column: ColumnInspection) -> tuple[str, str]:
-    """Guess the unit of a numeric time column; also return the evidence."""
-    if column.unit and is_time_unit(column.unit):
-        return column.unit, "its name"
-    name = column.key.lower()
-    for pattern, unit in _TIME_UNIT_PATTERNS:
-        if re.search(pattern, name):
-            return unit, "its name"
-    for unit in _UNITS:
-        if 1.0 <= column.first * _unit_seconds(unit) / _EPOCH_S < 2.0:
-            return unit, "its size, that of Unix time"
-    low, high = _SERIAL_RANGE
-    units = (*_UNITS, _SERIAL_DAYS) if low <= column.first < high else _UNITS
-    unit = min(units, key=lambda unit: _rate_distance(column, unit))
-    return unit, f"the rate of {1.0 / (column.pace * _unit_seconds(unit)):.4g} Hz that it gives"
-
-
-def _rate_distance(column: ColumnInspection, unit: str) -> float:
-    return (
-        abs(math.log10(1.0 / (column.pace * _unit_seconds(unit)) / TYPICAL_RATE_HZ)) / RATE_DECADES
-    )
 
 
 def _guess_axes(
