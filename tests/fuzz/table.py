@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
+from gyrostab import __version__
 from gyrostab.store.output import replace_file
 from tests.fuzz.campaign import Tally
 
@@ -59,6 +60,7 @@ def results(
     )
     return (
         f"Seed {seed}, jobs {jobs}: {tried} inputs took {seconds / 60.0:.1f} minutes, "
-        f"{tried / max(seconds, 1e-9):.0f} inputs per second.{stopped}\n\n"
+        f"{tried / max(seconds, 1e-9):.0f} inputs per second, with gyrostab {__version__}."
+        f"{stopped}\n\n"
         f"{table(totals)}\n\nFailures:\n\n{listed}"
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import gyrostab
 from tests.fuzz.campaign import (
     FORMATS,
     Input,
@@ -49,6 +50,7 @@ def test_results_of_a_campaign_leave_the_text_of_their_page(tmp_path: Path) -> N
     renew_results(page, results(totals, count=10, seed=3, jobs=1, seconds=60.0))
     renewed = page.read_text(encoding="utf-8")
     assert "Seed 3, jobs 1: 0 inputs took 1.0 minutes" in renewed
+    assert f"with gyrostab {gyrostab.__version__}." in renewed
     assert renewed.split(BEGIN)[0] == written.split(BEGIN)[0]
     assert renewed.split(END)[1] == written.split(END)[1]
 
