@@ -145,7 +145,8 @@ def _fit_sizes(
     """
     flat, power, shape = expected.ravel(), power.ravel(), shape.ravel()
     columns = columns.reshape(flat.size, -1)
-    size = np.maximum(np.abs(columns).max(axis=0), 1e-300)
+    largest = np.abs(columns).max(axis=0)
+    size = np.where(largest > 0.0, largest, 1.0)
     columns = columns / size
     good = np.isfinite(power) & np.isfinite(shape)
     fitted, sizes = flat, np.zeros(size.size)
@@ -153,7 +154,8 @@ def _fit_sizes(
         w = np.where(good, shape / fitted**2, 0.0)
         w = np.where(np.isfinite(w), w, 0.0)
         normal = (columns * w[:, None]).T @ columns + np.diag(prior / size**2)
-        normal += 1e-9 * np.diag(np.maximum(np.diagonal(normal), 1e-300))
+        diagonal = np.diagonal(normal)
+        normal += np.diag(np.where(diagonal > 0.0, 1e-9 * diagonal, 1.0))  # 1 where nothing shows
         right = columns.T @ (w * np.where(good, power - flat, 0.0))
         sizes = solve_bounded(normal, right, low * size)
         fitted = np.maximum(flat + columns @ sizes, MIN_POWER_RATIO * flat)
