@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
@@ -28,6 +29,7 @@ TIME_SHIFTS = 200
 SHIFT_RANGE = (0.05, 0.95)  # of the record
 Array = NDArray[np.float64]
 _PPM = 1e6  # in one
+_MIN_EIGENVALUE = 1e-12  # of a correlation; above rounding errors
 
 
 def keep_physical(
@@ -167,10 +169,35 @@ def _is_in_range(component: Component, state: State) -> bool:
     if not (np.isfinite(low) | np.isfinite(high)).any():
         return True
     sizes, covariance = component_mixture(component, state).moments()
-    error = state.settings.clear_sigma * np.sqrt(np.diagonal(covariance))
     # the parts of a complex size have the range of its column
     low, high = (np.repeat(ends, sizes.size // len(columns)) for ends in (low, high))
-    return bool(((sizes + error >= low) & (sizes - error <= high)).all())
+    return distance_to_range(sizes, covariance, low, high) <= state.settings.clear_sigma
+
+
+def distance_to_range(sizes: Array, covariance: Array, low: Array, high: Array) -> float:
+    """Return how far sizes are from a range of all together, in standard errors.
+
+    Sizes of columns that resemble each other have large errors, although their sum is well known.
+    Sizes of infinite error may have any value.
+
+    Examples
+    --------
+    >>> covariance = np.array([[1e4, -1e4], [-1e4, 1e4]]) + np.eye(2)
+    >>> sizes, limit = np.array([300.0, 300.0]), np.full(2, 20.0)
+    >>> round(distance_to_range(sizes, covariance, -limit, limit))
+    396
+    >>> round(distance_to_range(sizes, covariance, -20.0 * limit, 20.0 * limit), 6)
+    0.0
+    """
+    is_known = np.isfinite(np.diagonal(covariance))
+    sizes, low, high = sizes[is_known], low[is_known], high[is_known]
+    covariance = covariance[np.ix_(is_known, is_known)]
+    scale = np.sqrt(np.maximum(np.diagonal(covariance), np.finfo(float).tiny))
+    correlation = covariance / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(correlation)
+    whiten = (vectors / np.sqrt(np.maximum(values, _MIN_EIGENVALUE))).T
+    nearest = lsq_linear(whiten, whiten @ (sizes / scale), (low / scale, high / scale)).x
+    return float(np.linalg.norm(whiten @ (nearest - sizes / scale)))
 
 
 def _allowed_range(component: Component, column: str, state: State) -> tuple[float, float]:
