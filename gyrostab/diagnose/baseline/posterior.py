@@ -217,7 +217,7 @@ def visible_coefficients(density: float, span: float) -> tuple[float, float]:
     return float(np.sqrt(HOUR * 3.0 * density) / span), float(np.sqrt(density / span / 0.44))
 
 
-def _fine_grid(density: float, span: float, step: float) -> tuple[Array, Array]:
+def fine_grid(density: float, span: float, step: float) -> tuple[Array, Array]:
     """Return values of K and B, from invisible in the means to far above white noise."""
     K, B = visible_coefficients(density, span)
     top = 300.0 * span / step
@@ -225,6 +225,32 @@ def _fine_grid(density: float, span: float, step: float) -> tuple[Array, Array]:
         np.geomspace(0.1 * K, 0.1 * K * top, round(6.0 * np.log10(top))),
         np.geomspace(0.1 * B, 3.0 * B * np.sqrt(top), round(4.0 * np.log10(30.0 * np.sqrt(top)))),
     )
+
+
+def likelihood_of_means(
+    values: Array,
+    effects: Array | None,
+    *,
+    variance: Array,
+    step: float,
+    K: Array,
+    B: Array,
+    present: NDArray[np.bool_],
+    wander: RandomProcesses | None = None,
+) -> Array:
+    """Compute the log likelihood of block means for every K and B, (point,).
+
+    Arguments are those of `gyrostab.diagnose.evidence.products.mean_products`; the designs of
+    effects (block, column) have any size.
+    """
+    columns = scale_columns(effects, len(values))
+    products = mean_products(
+        values, columns, variance=variance, step=step, K=K, B=B, present=present, wander=wander
+    )
+    least_variance = np.maximum(variance[present].min(initial=1.0), 1e-300)
+    precision = _PRIOR_PRECISION * np.eye(columns.shape[1]) / least_variance
+    products = marginalise(products, columns.shape[1], precision)
+    return np.asarray(-0.5 * (products.square[:, 0] + products.log_determinant))
 
 
 def _likelihood_of_powers(
@@ -305,17 +331,12 @@ def noise_posterior(
     present, rng = use & np.isfinite(mean), np.random.default_rng(row)
     square, information, spectrum = fit_squares(fit)
     density = HOUR * max(float(square[1]), floor_square(fit))
-    coarse_K, coarse_B = _fine_grid(density, mean.size * step, step)
+    coarse_K, coarse_B = fine_grid(density, mean.size * step, step)
     K, B = (axis_values.ravel() for axis_values in np.meshgrid(coarse_K, coarse_B, indexing="ij"))
     values = np.where(present, mean, 0.0)[:, None]
-    columns = scale_columns(effects, mean.size)
-    products = mean_products(
-        values, columns, variance=variance, step=step, K=K, B=B, present=present, wander=wander
+    slow = likelihood_of_means(
+        values, effects, variance=variance, step=step, K=K, B=B, present=present, wander=wander
     )
-    least_variance = np.maximum(variance[present].min(initial=1.0), 1e-300)
-    precision = _PRIOR_PRECISION * np.eye(columns.shape[1]) / least_variance
-    products = marginalise(products, columns.shape[1], precision)
-    slow = -0.5 * (products.square[:, 0] + products.log_determinant)
     fast, best, normal = _likelihood_of_powers(fit, spectrum, K, B)
     joined = bool(slow.max() + fast.max() - (slow + fast).max() < settings.disagreement_nats)
     log = slow + fast if joined else slow

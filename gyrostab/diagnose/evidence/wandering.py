@@ -35,19 +35,46 @@ def expected_processes(baseline: xr.Dataset, axis: str | int) -> RandomProcesses
     )
 
 
-def with_walk(baseline: xr.Dataset, axis: str, walk: Array) -> xr.Dataset:
-    """Return the baseline with another random walk in the mean of an axis.
+def add_correlated(processes: RandomProcesses, square: float, time: float) -> RandomProcesses:
+    """Return the processes and one more, with this variance and correlation time."""
+    return processes._replace(
+        square=np.append(processes.square, square), time=np.append(processes.time, time)
+    )
 
-    The walk (block,) is the growth of its variance [degree2 hour-2 s-1].
+
+def with_process(
+    baseline: xr.Dataset, axis: str, variance: Array, time: float = np.inf
+) -> xr.Dataset:
+    """Return the baseline with another random process in the mean of an axis.
+
+    Parameters
+    ----------
+    variance : ndarray, shape (block,)
+        Of a process that is exponentially correlated, the same in all blocks [degree2 hour-2]; of a
+        random walk, what its variance grows by in a second [degree2 hour-2 s-1].
+    time : float
+        Correlation time [s]; infinite for a random walk.
     """
     axes = baseline["axis"].values.tolist()
-    total = np.stack([expected_processes(baseline, name).walk for name in axes])
-    total[axes.index(axis)] += walk
-    values: dict[str, tuple[tuple[str, ...], Array]] = {"wander_walk": (("axis", "block"), total)}
-    if "wander_square" not in baseline:
-        values["wander_square"] = (("axis", "wander"), np.zeros((len(total), 0)))
-        values["wander_time"] = (("wander",), np.zeros(0))
-    return baseline.assign(values)
+    row, shape = axes.index(axis), (len(axes), baseline.sizes["block"])
+    square, times, walk = np.zeros((len(axes), 0)), np.zeros(0), np.zeros(shape)
+    if "wander_square" in baseline:
+        square, times, walk = (
+            baseline.variables[name].values.copy()
+            for name in ("wander_square", "wander_time", "wander_walk")
+        )
+        baseline = baseline.drop_vars(["wander_square", "wander_time"])
+    if np.isinf(time):
+        walk[row] += variance
+    else:
+        added = np.zeros((len(axes), 1))
+        added[row] = variance[0]
+        square, times = np.concatenate([square, added], axis=1), np.append(times, time)
+    return baseline.assign(
+        wander_square=(("axis", "wander"), square),
+        wander_time=(("wander",), times),
+        wander_walk=(("axis", "block"), walk),
+    )
 
 
 def allan_variance(tau: float, time: Array) -> Array:

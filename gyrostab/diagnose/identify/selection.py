@@ -83,6 +83,8 @@ def _select_all(
 ) -> tuple[list[Selection], dict[str, tuple[str, float]]]:
     """Select the best candidate, put it into the model, and repeat while one passes.
 
+    What wanders without a course comes last, once no other effect passes.
+
     Returns
     -------
     chosen : list of Selection
@@ -102,12 +104,16 @@ def _select_all(
     }
     effects_left, lines_left = MAX_EFFECTS, MAX_LINES
     beaten: dict[str, tuple[str, float]] = {}
+    is_last = False
     while effects_left > 0:
-        all_evidence = score_candidates(examination, state, barred)
+        all_evidence = score_candidates(examination, state, barred, with_last=is_last)
         selected = _select_next(examination, all_evidence, state, chosen, beaten)
+        selections, shifted = selected or ([], {})
+        if not is_last and not shifted and not any(item.is_named for item in selections):
+            is_last = True
+            continue
         if selected is None:
             break
-        selections, shifted = selected
         beaten |= shifted
         barred |= shifted.keys()
         for selection in selections:
@@ -146,13 +152,19 @@ def score_candidates(
     examination: Examination,
     state: State,
     barred: Collection[str],
+    *,
+    with_last: bool = True,
 ) -> list[CandidateEvidence]:
     """Compute the evidence of all candidates that are not barred.
 
     Powers are weighted with the strongest effect in the powers, because its noise is in every
     statistic.
     """
-    sought = [candidate for candidate in examination.candidates if candidate.key not in barred]
+    sought = [
+        candidate
+        for candidate in examination.candidates
+        if candidate.key not in barred and (with_last or not candidate.statistic.is_tried_last)
+    ]
     all_evidence = examination.compute_evidence(sought, state)
     weighted = [
         evidence.candidate

@@ -27,13 +27,23 @@ def with_correlated_powers(prediction: Prediction, blocks: xr.Dataset) -> Predic
     spectrum = dict(prediction.spectrum)
     for name, (time, variance) in prediction.wander.items():
         if name in spectrum and np.isfinite(time):
-            power = _band_powers(blocks, time)
+            power = correlated_band_powers(blocks, time)
             per_band = spectrum[name].shape[-1] // power.size
             spectrum[name] = np.asarray(variance)[:, None] * np.repeat(power, per_band)
     return replace(prediction, spectrum=spectrum)
 
 
-def _band_powers(blocks: xr.Dataset, time: float) -> Array:
+def is_correlated_bias(name: str, prediction: Prediction, blocks: xr.Dataset) -> bool:
+    """Return whether a random process is a bias of random course that the block means show.
+
+    A process faster than half a block shows in the powers alone; one of two levels by its course.
+    """
+    time, _ = prediction.wander.get(name, (0.0, None))
+    is_slow = float(blocks.attrs["block_s"]) / 2.0 <= time < np.inf
+    return is_slow and not prediction.levels
+
+
+def correlated_band_powers(blocks: xr.Dataset, time: float) -> Array:
     """Return the expected power (band,) of a process of unit variance [Hz-1]."""
     size, rate = int(blocks.attrs["block_samples"]), float(blocks.attrs["sampling_rate_hz"])
     return average_in_bands(correlated_powers(taper(size), rate, ordinates(size), time), blocks)

@@ -154,11 +154,11 @@ def measure_evidence(
     """Measure what the effects gain on held-out data, with the noise fitted together with them.
 
     The likelihood of `held_out` is that of means, powers and cross-spectra. Sample counts,
-    telegraph biases and phase-locked components are in none of these: their evidence is added.
+    random biases and phase-locked components are in none of these: their evidence is added.
     """
-    without_telegraph, telegraph_nats = _remove_telegraph_bias(identifications)
-    judged, phase_locked_nats = remove_phase_locked(without_telegraph, blocks)
-    identified = without_telegraph.identified
+    with_course, random_nats = _remove_random_biases(identifications)
+    judged, phase_locked_nats = remove_phase_locked(with_course, blocks)
+    identified = with_course.identified
     count_nats = sum(
         component.evidence_nats
         for component in components_of(identified)
@@ -166,7 +166,7 @@ def measure_evidence(
     )
     clean = mask_anomalous_blocks(
         blocks,
-        [*components_of(identified), *components_of(without_telegraph.expected)],
+        [*components_of(identified), *components_of(with_course.expected)],
         identifications.state.settings,
     )
 
@@ -178,9 +178,9 @@ def measure_evidence(
         left_out = tuple(compress(renewed.identified, is_left_out))
         return predict_baseline(renewed, noise, known, left_out=left_out)
 
-    before = partial(expected_baseline, without_telegraph, baseline)
+    before = partial(expected_baseline, with_course, baseline)
     after = partial(train, judged) if judged.identified else before
-    with_phase_locked = partial(train, without_telegraph) if identified else before
+    with_phase_locked = partial(train, with_course) if identified else before
     settings = identifications.state.settings
     known = select_forecast_start(blocks)
     begun = tuple(
@@ -195,7 +195,7 @@ def measure_evidence(
         clean,
         before,
         after,
-        more_gain=count_nats + telegraph_nats + phase_locked_nats,
+        more_gain=count_nats + random_nats + phase_locked_nats,
         shown=with_phase_locked if phase_locked_nats else None,
         forecast=partial(train, replace(judged, identified=begun), is_left_out=is_over)
         if has_forecast
@@ -206,23 +206,24 @@ def measure_evidence(
     return evidence
 
 
-def _remove_telegraph_bias(identifications: Identifications) -> tuple[Identifications, float]:
-    """Drop the telegraph biases, and return their evidence [nats].
+def _remove_random_biases(identifications: Identifications) -> tuple[Identifications, float]:
+    """Drop biases that wander or switch at random, and return their evidence [nats].
 
-    No held-out data show the course of one.
+    No held-out data show the course of one. Their Bayes factor is the sum of what they gain when
+    every block is predicted from those before it.
     """
-    switching = [
+    random_biases = [
         identification
         for identification in identifications.identified
-        if any(component.statistic.is_switching for component in identification.components)
+        if any(component.statistic.is_random_bias for component in identification.components)
     ]
     identified = tuple(
         identification
         for identification in identifications.identified
-        if identification not in switching
+        if identification not in random_biases
     )
     return replace(identifications, identified=identified), sum(
-        identification.evidence_nats for identification in switching
+        identification.evidence_nats for identification in random_biases
     )
 
 

@@ -51,7 +51,7 @@ def held_out(
         ``cross`` (pair, block, band).
     more_gain : float
         Held-out gain [nats] of what is in neither means nor powers nor cross-spectra, to be added:
-        sample counts, phase-locked components, telegraph biases. Lines are in the powers of their
+        sample counts, phase-locked components, random biases. Lines are in the powers of their
         bands already and would count twice.
     shown : callable, optional
         The same with all effects, those of `more_gain` included, for the Allan variance; `after` by

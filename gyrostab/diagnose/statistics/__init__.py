@@ -22,6 +22,7 @@ from gyrostab.diagnose.statistics.spectral_line import SpectralLine
 from gyrostab.diagnose.statistics.telegraph import Telegraph
 from gyrostab.diagnose.statistics.transfer import Transfer
 from gyrostab.diagnose.statistics.variance_stability import VarianceStability
+from gyrostab.diagnose.statistics.wandering_bias import WanderingBias
 
 __all__ = ["STATISTICS", "Statistic", "find_statistic"]
 
@@ -36,6 +37,7 @@ STATISTICS: tuple[Statistic, ...] = (
     RampPhase(),
     SpectralLine(),
     RandomProcess(),
+    WanderingBias(),
     Telegraph(),
     CommonMode(),
     Restart(),

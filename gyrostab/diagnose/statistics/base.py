@@ -95,6 +95,7 @@ class Statistic:
     is_in_means = False  # whether effects move the block means,
     is_linear_in_means = False  # by columns,
     is_switching = False  # by two levels of free course
+    is_random_bias = False  # by a bias of random course, which no other data predict
     is_power = False  # whether effects add power,
     is_pairwise = False  # covariance of two axes,
     is_rotation = False  # amplitudes at multiples of the rotation,
@@ -106,6 +107,7 @@ class Statistic:
     uses_line_spectra = False  # whether the score is of the spectrum at full resolution
     is_ratio = False  # whether the score is of a variance over the expected one
     grows_in_time = True  # whether adjacent regions of a mismatch are one
+    is_tried_last = False  # whether an effect in it explains only what no other effect does
     takes_noise = True  # whether an effect takes a share of the noise of an axis
 
     def __repr__(self) -> str:

@@ -11,6 +11,7 @@ import xarray as xr
 from gyrostab.diagnose.evidence.held_out import LinearModel, noise_columns, with_independent_cells
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
+from gyrostab.diagnose.predict.correlated_powers import is_correlated_bias
 from gyrostab.diagnose.predict.filter_response import undo_filter
 from gyrostab.diagnose.predict.linear_model import (
     State,
@@ -112,7 +113,8 @@ class Power(Statistic):
             spectrum = {
                 name: with_axis(density)
                 for name, density in case.prediction.spectrum.items()
-                if _changes_over_time(density) or not case.prediction.coherent
+                if (_changes_over_time(density) or not case.prediction.coherent)
+                and not is_correlated_bias(name, case.prediction, case.blocks)
             }
         for columns, squared in ((level, False), (spectrum, True)):
             densities = {

@@ -1,4 +1,4 @@
-"""Random processes in the block means: exponentially correlated ones and walks."""
+"""Random walks in the block means that follow a channel."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.posterior import visible_coefficients
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.held_out import Tier, mean_factors
-from gyrostab.diagnose.evidence.wandering import with_walk
+from gyrostab.diagnose.evidence.wandering import with_process
 from gyrostab.diagnose.predict.average_sizes import plain_places
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
@@ -38,11 +38,10 @@ _FINE_FACTORS = 10.0 ** np.arange(-0.5, 3.1, 0.05)
 
 
 class RandomProcess(BlockMeanStatistic):
-    """A random process in the block means, which widens their scatter.
+    """A random walk in the block means that is present only while its channel is active.
 
-    No null record or score is its own. The flicker and random walk of the noise are free in the
-    evidence of means: a steady process cannot be distinguished from them there, but a random walk
-    that is present only while its channel is active can.
+    No null record or score is its own. The flicker and random walk of the noise are free in its
+    evidence, so that a steady walk could not be distinguished from them.
     """
 
     name = "random_process"
@@ -56,13 +55,10 @@ class RandomProcess(BlockMeanStatistic):
     takes_noise = False
 
     def design(self, case: Prospect) -> Iterator[Variant]:
-        """Yield processes slower than half a block."""
-        block = float(case.blocks.attrs["block_s"])
+        """Yield random walks whose strength changes in time."""
         for name, (time, variance) in case.prediction.wander.items():
-            if time >= block / 2.0:
-                yield Variant(
-                    case.values, (name,), np.asarray(variance)[None], squared=True, time=time
-                )
+            if np.isinf(time) and np.ptp(variance) > 0.0:
+                yield Variant(case.values, (name,), np.asarray(variance)[None], squared=True)
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
         """Compute the Bayes factor of random walks that follow a channel, of any size.
@@ -71,8 +67,6 @@ class RandomProcess(BlockMeanStatistic):
         """
         out = []
         for candidate in group:
-            if not any(candidate.driver) or not all(map(_is_changing_walk, candidate.variants)):
-                continue
             prior = np.array([variant.weight for variant in candidate.variants])
             evidence_nats, best = [], []
             for axis in trial.state.axes:
@@ -93,11 +87,9 @@ class RandomProcess(BlockMeanStatistic):
 
     def condition(self, state: State, component: Component) -> State:
         """Put a random walk that follows a channel into the noise of the means."""
-        if not _is_changing_walk(component.variant):
-            return state
         size, _ = _walk_size(component, state, component.variant)
         walk = size**2 * component.variant.design[0]
-        return replace(state, baseline=with_walk(state.baseline, component.row[0], walk))
+        return replace(state, baseline=with_process(state.baseline, component.row[0], walk))
 
     def estimate(self, fit: SizeFit) -> Sizes:
         """Estimate the size of a random walk that follows a channel, for its best exponent."""
@@ -111,11 +103,6 @@ class RandomProcess(BlockMeanStatistic):
     def is_modelled_in(self, region: Mapping[str, Any], *, together: bool) -> bool:
         """Return whether the baseline contains it: axes that wander together are in no model."""
         return not together
-
-
-def _is_changing_walk(variant: Variant) -> bool:
-    """Return whether a process is a random walk whose strength changes in time."""
-    return bool(np.isinf(variant.time) and np.ptp(variant.design) > 0.0)
 
 
 def _plain_or_best(candidate: Candidate, evidence_nats: Array, settings: Settings) -> Variant:
@@ -159,7 +146,7 @@ def _walk_factors(
     def log_evidence(walk: Array) -> Array:
         factors = mean_factors(
             data,
-            with_walk(baseline, axis, walk),
+            with_process(baseline, axis, walk),
             [],
             axis=axis,
             tier=tier,

@@ -48,6 +48,7 @@ class Telegraph(BlockMeanStatistic):
     name = "telegraph"
     is_in_means = True
     is_switching = True
+    is_random_bias = True
 
     def competitors(
         self, components: Sequence[Component], state: State, error: float

@@ -11,7 +11,7 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence, line_skirt
-from gyrostab.diagnose.evidence.wandering import with_walk
+from gyrostab.diagnose.evidence.wandering import with_process
 from gyrostab.diagnose.identify import selection
 from gyrostab.diagnose.identify.components import merge_lines
 from gyrostab.diagnose.identify.examination import nuisance_alternatives
@@ -136,7 +136,7 @@ def test_evidence_is_recalled_only_where_nothing_has_changed() -> None:
         "other weights": replace(start, weight=1.1 * start.weight),
         "masked": replace(start, masked=start.masked | (np.arange(start.masked.shape[1]) < 2)),
         "random walk": replace(
-            start, baseline=with_walk(start.baseline, "x", np.full(start.masked.shape[1], 1e-3))
+            start, baseline=with_process(start.baseline, "x", np.full(start.masked.shape[1], 1e-3))
         ),
     }
     compute_evidence(candidates, blocks, start, folds)

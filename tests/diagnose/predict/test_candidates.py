@@ -77,7 +77,7 @@ def test_grids_are_small_enough_to_try_all_points(tried_effects):
         ("spectral_line", {"spectral_line"}),
         ("spikes", {"sample_counts"}),
         ("logger_filter", {"power"}),
-        ("gauss_markov", {"power", "random_process"}),
+        ("gauss_markov", {"power", "wandering_bias"}),
     ],
 )
 def test_effects_show_in_the_expected_statistics(tried_effects, effect, statistics):

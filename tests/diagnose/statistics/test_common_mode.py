@@ -215,10 +215,10 @@ def test_common_motion_is_one_region_explained_by_its_effect(base, null):
 
     assert explanation_of("mean", "xyz", known) == ["cause"]
     assert explanation_of("mean", "xyz", base) == []  # in the model, but leaves the mismatch
-    assert explanation_of("random_process", "xyz", base) == [
+    assert explanation_of("wandering_bias", "xyz", base) == [
         "cause"
     ]  # its covariance is in no model
-    assert explanation_of("random_process", "x", base) == []
+    assert explanation_of("wandering_bias", "x", base) == []
 
 
 def test_common_motion_is_separate_from_common_noise_within_blocks():

@@ -1,0 +1,78 @@
+"""Evidence of an exponentially correlated bias, from means and powers of simulated records."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from gyrostab import diagnose
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.baseline.correlated_bias import CorrelatedBias, find_correlated_bias
+from gyrostab.diagnose.predict.linear_model import initial_state
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.noise import NORMAL_95
+from gyrostab.simulate import simulate
+
+NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
+
+
+def _model(noise: dict[str, float], rms: float = 0.0, time: float = 1.0) -> dict:
+    bias = {"name": "gauss_markov", "axes": ["x"], "rms": rms, "correlation_time": time}
+    return {"noise": {"x": noise, "y": NOISE}, "effect": [bias] if rms else []}
+
+
+def _find(model: dict, seed: int, duration: str = "1h") -> CorrelatedBias:
+    blocks = reduce_log(simulate(model, duration=duration, rate=10.0, seed=seed).sel(axis=["x"]))
+    found = find_correlated_bias(initial_state(blocks, calibrate_noise(blocks)), "x")
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [{"N": 0.003}, {"N": 0.003, "B": 0.1, "K": 1.0, "Q": 0.3}],
+    ids=["white", "strong"],
+)
+def test_noise_shows_no_bias(noise):
+    """By Markov's inequality at most one record in 20 exceeds 3 nats."""
+    nats = [_find(_model(noise), seed, "40min").nats for seed in range(6)]
+    assert np.sum(np.array(nats) > 3.0) <= 1
+    assert np.median(nats) < 0.0
+
+
+@pytest.mark.parametrize(
+    ("rms", "time", "count"),
+    [
+        (0.3, 20.0, 5),
+        pytest.param(0.1, 30.0, 40, marks=pytest.mark.full),
+        pytest.param(0.15, 100.0, 40, marks=pytest.mark.full),
+    ],
+)
+def test_bias_is_found_with_its_size_and_time(rms, time, count):
+    """The logarithms of both are within 3.5 standard errors, and the errors are of the right size.
+
+    The mean of n squared errors, in standard errors, is 1 with a standard deviation of sqrt(2 / n).
+    """
+    found = [_find(_model(NOISE, rms, time), seed) for seed in range(count)]
+    errors = np.log([(bias.rms / rms, bias.time / time) for bias in found])
+    z = errors / np.sqrt([np.diag(bias.covariance) for bias in found])
+    assert np.abs(z).max() < 3.5
+    square = np.mean(z**2, axis=0)
+    assert (np.abs(square - 1.0) < 3.0 * np.sqrt(2.0 / count)).all()
+    assert (square > 0.05).all()
+    assert np.mean([bias.nats for bias in found]) > 3.0
+
+
+def test_bias_is_named_on_its_axis_and_may_be_a_telegraph():
+    log = simulate(_model(NOISE, 0.2, 15.0), duration="1h", rate=10.0, seed=8)
+    content = json.loads(diagnose(log, nulls=100).to_json())
+    (effect,) = content["effects"]
+    assert (effect["name"], effect["axes"]) == ("gauss_markov", ["x"])
+    assert effect["alternatives"] == ["telegraph"]
+    assert content["verdict"] == "explained"
+    for name, truth in (("rms", 0.2), ("correlation_time", 15.0)):
+        size = effect["parameters"][name]
+        assert abs(np.log(size["value"] / truth)) < 1.5 * NORMAL_95 * size["stderr"] / size["value"]
+        assert size["low"] < size["value"] < size["high"]
