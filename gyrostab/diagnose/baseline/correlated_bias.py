@@ -55,7 +55,7 @@ _LEVEL_GROUPS = 30  # of blocks of similar power, where effects change it; limit
 #: Range of the density of the bias at low frequencies, over that of white noise. Design choice.
 _DENSITY_RATIOS = np.array([0.1, 1e6])
 _TIMES = 24  # of the powers that are interpolated
-_STARTS = 9  # values of every parameter, evenly spaced in log, from which a search may start
+_STARTS = 7  # values of every parameter, evenly spaced in log, from which a search may start
 _STEP = 0.05  # of a logarithm, for the curvature of the likelihood
 
 
@@ -212,7 +212,7 @@ def _find_peaks(record: _AxisRecord) -> tuple[_Peak, _Peak]:
     grid = [np.linspace(*ends, _STARTS) for ends in zip(record.low, record.high, strict=True)]
     without = record.find_peak((np.array([K, B]) for B in grid[1]) for K in grid[0][::2])
     # next to a bias, K and B are as without it, or hidden
-    noise = product(*zip(without.point, record.low[:2], strict=True))
+    noise = (without.point, record.low[:2])
     peak = record.find_peak(
         (np.array([*slow, *bias]) for bias in product(*grid[2:])) for slow in noise
     )
