@@ -83,7 +83,7 @@ def _select_all(
 ) -> tuple[list[Selection], dict[str, tuple[str, float]]]:
     """Select the best candidate, put it into the model, and repeat while one passes.
 
-    What wanders without a course comes last, once no other effect passes.
+    What wanders without a course comes last, once nothing else passes.
 
     Returns
     -------
@@ -108,12 +108,13 @@ def _select_all(
     while effects_left > 0:
         all_evidence = score_candidates(examination, state, barred, with_last=is_last)
         selected = _select_next(examination, all_evidence, state, chosen, beaten)
-        selections, shifted = selected or ([], {})
-        if not is_last and not shifted and not any(item.is_named for item in selections):
+        if selected is None and not is_last:
             is_last = True
             continue
         if selected is None:
             break
+        is_last = False
+        selections, shifted = selected
         beaten |= shifted
         barred |= shifted.keys()
         for selection in selections:
