@@ -54,11 +54,11 @@ def check_update(
     """
     listed = {full_name(path) for path in [*archive.files, *archive.diagnoses]}
     known_names: Any = [] if known_table is None else known_table["file"]
-    other = next((name for name in known_names if name not in listed and _exists(name)), None)
+    other = next((name for name in known_names if name not in listed and _file_exists(name)), None)
     plain = json.loads(json.dumps(options, default=str))
     same: dict[str, Any] = {"inputs": [], "versions": {}}
     changes = (
-        f"it is also of {other}"
+        f"it has results of {other}, which is not among the files given"
         if other
         else describe_differences({**same, "options": known_options}, {**same, "options": plain})
     )
@@ -70,7 +70,7 @@ def check_update(
         )
 
 
-def _exists(name: str) -> bool:
+def _file_exists(name: str) -> bool:
     url = find_url(name)
     return bool(find_kind(url, required=False)) if url else os.path.exists(name)
 

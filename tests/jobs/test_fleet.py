@@ -244,7 +244,7 @@ def test_results_of_other_files_or_options_are_replaced_with_overwrite_only(tmp_
     run_fleet([tmp_path / "spring"], output, **OPTIONS)
     before = (output / "run.nc").read_bytes()
     others = {
-        r"it is also of .*spring/run/log\.nc": {"paths": [tmp_path / "autumn"]},
+        r"it has results of .*spring/run/log\.nc": {"paths": [tmp_path / "autumn"]},
         "per is file, was folder": {"per": "file"},
         "window is 2min, was ": {"windows": {"window": "2min"}},
     }
@@ -276,7 +276,7 @@ def test_a_table_of_other_files_is_replaced_with_overwrite_only(tmp_path):
     names = [str(folder / "log.nc") for folder in folders]
     write_file_table(folders[:1], table, scheduler="threads")
     before = table.read_bytes()
-    with pytest.raises(OutputError, match=r"it is also of .*spring/log\.nc"):
+    with pytest.raises(OutputError, match=r"it has results of .*spring/log\.nc"):
         write_file_table(folders[1:], table, scheduler="threads")
     with pytest.raises(OutputError, match="kind is angle, was not given"):
         write_file_table(folders[:1], table, scheduler="threads", reading={"kind": "angle"})

@@ -2,8 +2,8 @@
 
 Its spectrum is level at low frequencies and falls beyond a corner. Flicker and random walk of the
 right size come close to either part, but not to both. Block means and band powers must therefore be
-explained together, with the same flicker and random walk; each alone shows a few percent of the
-evidence. Where the powers scatter more about the best fit than their own statistics say, because of
+explained together, with the same flicker and random walk; each alone, with its own, shows only a
+part of the evidence. Where the powers scatter more about the best fit than their own statistics say, because of
 lines or of the steep spectrum that leaks into all bands, they count less.
 """
 
@@ -42,21 +42,26 @@ from gyrostab.diagnose.evidence.wandering import (
 from gyrostab.diagnose.predict.condition import fit_powers
 from gyrostab.diagnose.predict.correlated_powers import correlated_band_powers
 from gyrostab.diagnose.predict.linear_model import State, band_widths, unspread_share
+from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
 _MIN_NOISE_SHARE = 0.05  # of the power of Q and N, that effects may leave; design choice
-_MAX_SCATTER = 3.0  # of differences of neighbouring means, up to which K and B are tried
-_SCORING_STEPS = 4
+#: K and B are tried up to this multiple of the scatter of neighbouring means. Design choice: far
+#: above, because too low a limit makes a bias of what is noise.
+_MAX_SCATTER = 3.0
+_SCORING_STEPS = 4  # of Fisher scoring, as in `gyrostab.diagnose.predict.condition`
 _MIN_CHANGE = 1e-6  # of the expected powers, from which effects change them; above rounding errors
 _LEVEL_GROUPS = 30  # of blocks of similar power, where effects change it; limits time
 #: Range of the density of the bias at low frequencies, over that of white noise. Design choice.
 _DENSITY_RATIOS = np.array([0.1, 1e6])
-_TIMES = 24  # of the powers that are interpolated
-_STARTS = 7  # values of every parameter, evenly spaced in log, from which a search may start
-_STEP = 0.05  # of a logarithm, for the curvature of the likelihood
+_TIMES = 24  # at which powers are computed; between them, they are interpolated
+#: Values of every parameter, evenly spaced in log, from which a search may start. With 9, and twice
+#: as many combinations, 19 fits were the same to the digits printed.
+_STARTS = 7
+_STEP = 0.05  # of a logarithm, for the curvature of the likelihood by differences
 
 
 class CorrelatedBias(NamedTuple):
@@ -160,7 +165,7 @@ class _AxisRecord:
             ),
             key=lambda result: float(result.fun),
         )
-        precision = _curvature(objective, best.x)
+        precision = _measure_curvature(objective, best.x)
         volume = float(np.log(np.diff(bounds)).sum())
         evidence = (
             -float(best.fun)
@@ -219,7 +224,7 @@ def _find_peaks(record: _AxisRecord) -> tuple[_Peak, _Peak]:
     return without, peak
 
 
-def _curvature(objective: Callable[[Array], float], best: Array) -> Array:
+def _measure_curvature(objective: Callable[[Array], float], best: Array) -> Array:
     """Return the Hessian at a minimum, with curvatures of at least 1.
 
     A parameter that the record hardly determines may then have any value within a few octaves.
@@ -254,7 +259,7 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
     chosen = ~state.masked[row] & (np.isfinite(power) & np.isfinite(shape)).any(axis=1)
     values = mean_residual(blocks, baseline, axis)
     present = np.isfinite(values[:, 0])
-    if chosen.sum() < 4 or present.sum() < 4:
+    if chosen.sum() < MIN_BLOCKS or present.sum() < MIN_BLOCKS:
         return None
     bands = blocks.sizes["band"]
     common, shape_alone = (array[row] for array in common_variance(blocks))

@@ -107,7 +107,7 @@ class Statistic:
     uses_line_spectra = False  # whether the score is of the spectrum at full resolution
     is_ratio = False  # whether the score is of a variance over the expected one
     grows_in_time = True  # whether adjacent regions of a mismatch are one
-    is_tried_last = False  # whether an effect in it explains only what no other effect does
+    is_tried_last = False  # whether an effect in it explains only what nothing else does
     takes_noise = True  # whether an effect takes a share of the noise of an axis
 
     def __repr__(self) -> str:

@@ -60,8 +60,8 @@ class WanderingBias(RandomProcess):
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
         """Compute the Bayes factor of a bias of any rms and correlation time.
 
-        In noise it exceeds x with a probability of at most 1 / x (Markov's inequality), so that no
-        null records are tried.
+        No null records are tried: averaged over the noise that it allows for, a Bayes factor
+        exceeds x in noise with a probability of at most 1 / x (Markov's inequality).
         """
         if trial.is_null:
             return []
@@ -127,7 +127,9 @@ def _is_calibrated_with(axis: str, state: State) -> bool:
 def _find_bias(state: State, axis: str) -> CorrelatedBias | None:
     """Find the bias of an axis next to all other effects, or recall it if nothing has changed."""
     if _is_calibrated_with(axis, state):  # with this bias
-        without = state.baseline.drop_vars(["wander_square", "wander_time", "wander_walk"])
+        without = state.baseline.drop_vars(
+            ["wander_square", "wander_time", "wander_walk"], errors="ignore"
+        )
         noise = sum_noise(without["columns"].values, without["square"].values)
         spectrum = without["spectrum"].copy(data=noise)
         state = replace(state, baseline=without.assign(spectrum=spectrum))

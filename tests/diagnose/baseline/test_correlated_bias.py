@@ -18,12 +18,12 @@ from gyrostab.simulate import simulate
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
 
 
-def _model(noise: dict[str, float], rms: float = 0.0, time: float = 1.0) -> dict:
+def _make_model(noise: dict[str, float], rms: float = 0.0, time: float = 1.0) -> dict:
     bias = {"name": "gauss_markov", "axes": ["x"], "rms": rms, "correlation_time": time}
     return {"noise": {"x": noise, "y": NOISE}, "effect": [bias] if rms else []}
 
 
-def _find(model: dict, seed: int, duration: str = "1h") -> CorrelatedBias:
+def _find_on_x(model: dict, seed: int, duration: str = "1h") -> CorrelatedBias:
     blocks = reduce_log(simulate(model, duration=duration, rate=10.0, seed=seed).sel(axis=["x"]))
     found = find_correlated_bias(initial_state(blocks, calibrate_noise(blocks)), "x")
     assert found is not None
@@ -37,7 +37,7 @@ def _find(model: dict, seed: int, duration: str = "1h") -> CorrelatedBias:
 )
 def test_noise_shows_no_bias(noise):
     """By Markov's inequality at most one record in 20 exceeds 3 nats."""
-    nats = [_find(_model(noise), seed, "40min").nats for seed in range(6)]
+    nats = [_find_on_x(_make_model(noise), seed, "40min").nats for seed in range(6)]
     assert np.sum(np.array(nats) > 3.0) <= 1
     assert np.median(nats) < 0.0
 
@@ -55,7 +55,7 @@ def test_bias_is_found_with_its_size_and_time(rms, time, count):
 
     The mean of n squared errors, in standard errors, is 1 with a standard deviation of sqrt(2 / n).
     """
-    found = [_find(_model(NOISE, rms, time), seed) for seed in range(count)]
+    found = [_find_on_x(_make_model(NOISE, rms, time), seed) for seed in range(count)]
     errors = np.log([(bias.rms / rms, bias.time / time) for bias in found])
     z = errors / np.sqrt([np.diag(bias.covariance) for bias in found])
     assert np.abs(z).max() < 3.5
@@ -66,7 +66,7 @@ def test_bias_is_found_with_its_size_and_time(rms, time, count):
 
 
 def test_bias_is_named_on_its_axis_and_may_be_a_telegraph():
-    log = simulate(_model(NOISE, 0.2, 15.0), duration="1h", rate=10.0, seed=8)
+    log = simulate(_make_model(NOISE, 0.2, 15.0), duration="1h", rate=10.0, seed=8)
     content = json.loads(diagnose(log, nulls=100).to_json())
     (effect,) = content["effects"]
     assert (effect["name"], effect["axes"]) == ("gauss_markov", ["x"])

@@ -40,6 +40,22 @@ def test_added_power_is_not_negative(state, kind, lowest):
     assert ratio.min() == pytest.approx(lowest, abs=0.05)
 
 
+def test_power_of_masked_blocks_alone_changes_no_other_size(state):
+    """Its size is not determined, and was infinite next to a size at its bound."""
+    frequency = state.blocks["frequency"].values / state.blocks["frequency"].values.max()
+    block = np.arange(state.blocks.sizes["block"])[:, None]
+    falls = (block < block.size // 2) * frequency**2
+    masked = state.masked.copy()
+    masked[0, -1] = True
+    state = replace(state, masked=masked)
+    hidden = (block == block.size - 1) * np.ones_like(frequency)
+    without, fitted = (
+        fit_powers(state.with_columns("added_power", "x", columns), "x")
+        for columns in ([falls], [falls, hidden])
+    )
+    np.testing.assert_allclose(fitted[:-1], without[:-1], rtol=1e-6)
+
+
 def two_terms(state: State, columns: tuple[str, ...]) -> Component:
     """White noise and noise that rises with the frequency, added in half of the blocks."""
     frequency = state.blocks["frequency"].values / state.blocks["frequency"].values.max()
