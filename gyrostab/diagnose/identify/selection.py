@@ -83,7 +83,7 @@ def _select_all(
 ) -> tuple[list[Selection], dict[str, tuple[str, float]]]:
     """Select the best candidate, put it into the model, and repeat while one passes.
 
-    What wanders without a course comes last, once nothing else passes.
+    What wanders without a course comes last, once no other effect passes.
 
     Returns
     -------
@@ -108,7 +108,8 @@ def _select_all(
     while effects_left > 0:
         all_evidence = score_candidates(examination, state, barred, with_last=is_last)
         selected = _select_next(examination, all_evidence, state, chosen, beaten)
-        if selected is None and not is_last:
+        has_effect = selected is not None and any(choice.is_named for choice in selected[0])
+        if not has_effect and not is_last:
             is_last = True
             continue
         if selected is None:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.correlated_bias import CorrelatedBias, find_correlated_bias
+from gyrostab.diagnose.baseline.correlated_bias import (
+    CorrelatedBias,
+    find_correlated_bias,
+    fit_rms,
+)
 from gyrostab.diagnose.baseline.expected_statistics import sum_noise
 from gyrostab.diagnose.evidence.held_out import mean_residual
 from gyrostab.diagnose.evidence.products import axis_noise
-from gyrostab.diagnose.evidence.wandering import with_process
+from gyrostab.diagnose.evidence.wandering import expected_processes, with_process
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
     CandidateEvidence,
@@ -36,6 +40,7 @@ from gyrostab.diagnose.statistics.random_process import RandomProcess
 from gyrostab.noise import NORMAL_95
 
 Array = NDArray[Any]
+Result = TypeVar("Result")
 
 
 class WanderingBias(RandomProcess):
@@ -63,15 +68,21 @@ class WanderingBias(RandomProcess):
         No null records are tried: averaged over the noise that it allows for, a Bayes factor
         exceeds x in noise with a probability of at most 1 / x (Markov's inequality).
         """
+        state = trial.state
         if trial.is_null:
             return []
         out = []
         for candidate in group:
-            biases = [_find_bias(trial.state, axis) for axis in trial.state.axes]
+            biases = [  # one on every axis
+                None
+                if expected_processes(state.baseline, axis).square.size
+                else _find_bias(state, axis)
+                for axis in state.axes
+            ]
             evidence_nats = np.array([[-np.inf if bias is None else bias.nats for bias in biases]])
             plain = candidate.variants[0]
             best = tuple(plain if bias is None else _with_time(plain, bias.time) for bias in biases)
-            rows = self.rows(candidate, trial.state)
+            rows = self.rows(candidate, state)
             out.append(CandidateEvidence(candidate, rows, evidence_nats, best))
         return out
 
@@ -84,14 +95,14 @@ class WanderingBias(RandomProcess):
 
     def condition(self, state: State, component: Component) -> State:
         """Put the bias into the noise of the means and of the powers, unless it is in both."""
-        axis = component.row[0]
-        bias = None if _is_calibrated_with(axis, state) else _find_bias(state, axis)
-        if bias is None:
+        axis, time = component.row[0], component.variant.time
+        if _is_calibrated_with(axis, state):
             return state
-        power = correlated_band_powers(state.blocks, bias.time)[None, None]
+        rms = _recall_fit(partial(fit_rms, state, axis, time), b"rms", axis, state, np.array(time))
+        power = correlated_band_powers(state.blocks, time)[None, None]
         column = power_column(power, state.axes.index(axis), state)
-        variance = bias.rms**2 * component.variant.design[0]
-        process = with_process(state.baseline, axis, variance, bias.time)
+        variance = rms**2 * component.variant.design[0]
+        process = with_process(state.baseline, axis, variance, time)
         return replace(state.with_columns("added_power", axis, [column]), baseline=process)
 
     def has_power_of_effect(self, component: Component, state: State) -> bool:
@@ -125,7 +136,7 @@ def _is_calibrated_with(axis: str, state: State) -> bool:
 
 
 def _find_bias(state: State, axis: str) -> CorrelatedBias | None:
-    """Find the bias of an axis next to all other effects, or recall it if nothing has changed."""
+    """Find the bias of an axis next to all other effects."""
     if _is_calibrated_with(axis, state):  # with this bias
         without = state.baseline.drop_vars(
             ["wander_square", "wander_time", "wander_walk"], errors="ignore"
@@ -133,11 +144,19 @@ def _find_bias(state: State, axis: str) -> CorrelatedBias | None:
         noise = sum_noise(without["columns"].values, without["square"].values)
         spectrum = without["spectrum"].copy(data=noise)
         state = replace(state, baseline=without.assign(spectrum=spectrum))
+    return _recall_fit(partial(find_correlated_bias, state, axis), b"correlated bias", axis, state)
+
+
+def _recall_fit(
+    compute: Callable[[], Result], name: bytes, axis: str, state: State, *inputs: Array
+) -> Result:
+    """Fit a bias of an axis next to all other effects, or recall the fit if nothing has changed."""
     processes, columns = axis_noise(state.baseline, axis), state.power_columns(axis)
     row = state.axes.index(axis)
     return state.recall(
-        partial(find_correlated_bias, state, axis),
-        b"correlated bias",
+        compute,
+        name,
+        *inputs,
         np.array(row),
         mean_residual(state.blocks, state.baseline, axis),
         state.given_to("mean", axis),

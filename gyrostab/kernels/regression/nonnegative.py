@@ -19,31 +19,32 @@ def solve_nonnegative(normal: Array, right: Array) -> Array:
 
     Parameters
     ----------
-    normal, right : ndarray (n, n), (n,)
+    normal, right : ndarray (..., n, n), (..., n)
         Normal equations.
 
     Returns
     -------
-    ndarray (n,)
+    ndarray (..., n)
 
     Examples
     --------
     >>> solve_nonnegative(np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0]))
     array([0.5, 0. ])
     """
-    solution = np.zeros(right.size)
-    used = np.flatnonzero(np.diagonal(normal) > 0.0)
-    scale = 1.0 / np.sqrt(np.diagonal(normal)[used])
-    scaled_right = right[used] * scale
-    every = np.arange(used.size)
-    members = (np.arange(1 << used.size)[:, None] >> every & 1).astype(np.float64)
-    systems = normal[np.ix_(used, used)] * np.outer(scale, scale)
+    width = right.shape[-1]
+    every = np.arange(width)
+    square = normal[..., every, every]
+    scale = np.where(square > 0.0, 1.0 / np.sqrt(np.where(square > 0.0, square, 1.0)), 0.0)
+    scaled_right = (right * scale)[..., None, :]
+    members = (np.arange(1 << width)[:, None] >> every & 1).astype(np.float64)
+    systems = (normal * scale[..., None] * scale[..., None, :])[..., None, :, :]
     systems = systems * members[:, :, None] * members[:, None, :]
-    systems[:, every, every] = 1.0 + 1e-12  # also of the terms that a subset lacks
+    systems[..., every, every] = 1.0 + 1e-12  # also of the terms that a subset lacks
     trials = np.linalg.solve(systems, (members * scaled_right)[..., None])[..., 0]
-    gains = np.where((trials >= 0.0).all(axis=1), trials @ scaled_right, -np.inf)
-    solution[used] = np.abs(trials[gains.argmax()]) * scale  # without a negative zero
-    return solution
+    gains = np.where((trials >= 0.0).all(axis=-1), (trials * scaled_right).sum(axis=-1), -np.inf)
+    best = gains.argmax(axis=-1)[..., None, None]
+    chosen = np.abs(np.take_along_axis(trials, best, axis=-2))  # without a negative zero
+    return np.asarray(chosen[..., 0, :] * scale)
 
 
 def solve_bounded(normal: Array, right: Array, low: Array) -> Array:

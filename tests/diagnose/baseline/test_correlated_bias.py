@@ -6,12 +6,19 @@ import json
 
 import numpy as np
 import pytest
+import xarray as xr
+from scipy.signal import lfilter
 
 from gyrostab import diagnose
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.correlated_bias import CorrelatedBias, find_correlated_bias
-from gyrostab.diagnose.predict.linear_model import initial_state
+from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.identify.components import find_components
+from gyrostab.diagnose.predict.condition import condition_on, refit_weights
+from gyrostab.diagnose.predict.linear_model import State, initial_state
+from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.noise import NORMAL_95
 from gyrostab.simulate import simulate
 
@@ -23,9 +30,14 @@ def _make_model(noise: dict[str, float], rms: float = 0.0, time: float = 1.0) ->
     return {"noise": {"x": noise, "y": NOISE}, "effect": [bias] if rms else []}
 
 
+def _start(log: xr.Dataset) -> State:
+    blocks = reduce_log(log)
+    return initial_state(blocks, calibrate_noise(blocks))
+
+
 def _find_on_x(model: dict, seed: int, duration: str = "1h") -> CorrelatedBias:
-    blocks = reduce_log(simulate(model, duration=duration, rate=10.0, seed=seed).sel(axis=["x"]))
-    found = find_correlated_bias(initial_state(blocks, calibrate_noise(blocks)), "x")
+    log = simulate(model, duration=duration, rate=10.0, seed=seed).sel(axis=["x"])
+    found = find_correlated_bias(_start(log), "x")
     assert found is not None
     return found
 
@@ -63,6 +75,43 @@ def test_bias_is_found_with_its_size_and_time(rms, time, count):
     assert (np.abs(square - 1.0) < 3.0 * np.sqrt(2.0 / count)).all()
     assert (square > 0.05).all()
     assert np.mean([bias.nats for bias in found]) > 3.0
+
+
+def test_bands_of_lines_are_no_evidence_of_a_bias():
+    """The lines are in the model, with powers of their own sizes."""
+    log = simulate(_make_model({"N": 0.003}), duration="40min", rate=10.0, seed=3).sel(axis=["x"])
+    phase = 2.0 * np.pi * np.arange(log.sizes["time"]) / 10.0
+    log["rate"] = log["rate"] + sum(3.0 * np.sin(f * phase) for f in (0.11, 0.17, 0.23))
+    state = _start(log)
+    bands = state.blocks.sizes["band"]
+    where = np.flatnonzero(state.blocks["band_high"].values <= 0.3)
+    columns = [np.broadcast_to(np.eye(bands)[band], state.weight.shape[1:]) for band in where]
+    in_model = refit_weights(state.with_columns("power", "x", columns))
+    found = [find_correlated_bias(tried, "x") for tried in (in_model, state)]
+    with_lines, without = (bias.nats for bias in found if bias is not None)
+    assert with_lines < 3.0 < without
+
+
+def test_a_bias_with_another_spectrum_is_found_once():
+    """A second-order process has a steeper spectrum, which several of first order would follow."""
+    log = simulate(_make_model(NOISE), duration="1h", rate=10.0, seed=4).sel(axis=["x"])
+    rng = np.random.default_rng(5)
+    decay = np.exp(-0.1 / 12.0)
+    bias = lfilter([1.0], [1.0, -2.0 * decay, decay**2], rng.standard_normal(log.sizes["time"]))
+    log["rate"] = log["rate"] + xr.DataArray(0.3 * bias / bias.std(), dims="time")
+    state = _start(log)
+    effects, _ = effect_candidates(state.blocks, state.baseline["coefficient"])
+    (candidate,) = [
+        candidate
+        for candidate in effects
+        if candidate.key == "gauss_markov" and candidate.statistic.name == "wandering_bias"
+    ]
+    folds = fold_blocks(state.blocks)
+    (evidence,) = compute_evidence([candidate], state.blocks, state, folds)
+    assert evidence.evidence_nats[0, 0] > 10.0
+    in_model = condition_on(state, find_components(evidence))
+    (evidence,) = compute_evidence([candidate], state.blocks, in_model, folds)
+    assert evidence.evidence_nats[0, 0] < 0.0
 
 
 def test_bias_is_named_on_its_axis_and_may_be_a_telegraph():
