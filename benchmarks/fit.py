@@ -18,6 +18,7 @@ from page import machine, make_parser, renew, table
 from gyrostab import davar, fit_noise, make_log
 from gyrostab.allan import window_fit
 from gyrostab.allan.fit_inputs import fit_inputs
+from gyrostab.kernels.allan.clusters import cluster_strides
 from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.freedoms import cell_freedoms, combine_diagonal
 from gyrostab.kernels.fit.least_squares import identify_noise
@@ -57,7 +58,9 @@ def measure(x: np.ndarray, taus: int, repeats: int) -> tuple[int, list[float]]:
     trends = [trend, np.stack(responses, axis=-1), exact]
     tables = window_fit.fit_tables(tuple(ks.tolist()), rate, window)
     noise_tables = (tables.columns, tables.weight, tables.to_samples)
-    diagonal = combine_diagonal(*product_tables(window, ks, diagonal=True))
+    diagonal = combine_diagonal(
+        *product_tables(window, ks, diagonal=True), cluster_strides(window, ks)
+    )
     whole = best(lambda: fit_noise(surface), repeats)
     kernel = best(lambda: window_fit.run_kernel(flat, *trends, tables, 31), repeats)
     options = {"white_error": np.zeros(trends[0].size), "allowed": 31, "observed_only": True}

@@ -46,6 +46,7 @@ LOSSES: dict[str, slice | tuple[float, float]] = {
     "10 %, one by one": (0.1, 1.0),
     "20 %, blocks of 5": (0.2, 5.0),
     "50 %, blocks of 50": (0.5, 50.0),
+    "20 %, one by one": (0.2, 1.0),
 }
 
 

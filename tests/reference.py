@@ -123,6 +123,10 @@ def fit_window_plainly(
     design = bare[:, :4] * np.stack([quantization, white, *np.ones((2, y.size))], axis=1)
     design -= part * trend[:4]
     excess = np.maximum(quantization - 1, 0) * bare[:, 0] / bare[:, 1]
+    # one sample of jumps across gaps at all averaging times; pairs of clusters that are left out
+    jumps = bare[:, 0] * np.sqrt(2 * np.maximum(quantization - 1, 0) / tables.weight[ok])
+    thinned = np.minimum(quantization, 1) ** 2 / factor * tables.diagonal[ok, 14] * (white > 1)
+    thinned *= tables.to_samples[0] ** 2
     z = y - part[:, 0] * trend[4]
 
     def covariance(s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -145,7 +149,8 @@ def fit_window_plainly(
             * np.sqrt(np.multiply.outer(ramp, ramp))
             * np.einsum("aij,aij->ij", outer, ramps)
         )
-        return total / np.maximum.outer(factor, factor)
+        gaps = np.outer(jumps, jumps) + np.diag(thinned)
+        return total / np.maximum.outer(factor, factor) + s[0] ** 2 * gaps
 
     def solve(whitener: NDArray[np.float64]) -> NDArray[np.float64]:
         columns = whitener @ design

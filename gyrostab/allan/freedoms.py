@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.allan.variance import variance_columns, white_freedoms
+from gyrostab.kernels.allan.clusters import cluster_strides
 from gyrostab.kernels.allan.surface import Cells
 from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.freedoms import cell_freedoms, combine_diagonal
@@ -62,7 +63,7 @@ def tabulate_noise(
     columns = variance_columns(variance, ks, rate)
     pairs, ramps = product_tables(window, ks, variance=variance, diagonal=True)
     weight = white_freedoms(variance, window, ks, pairs)
-    diagonal = combine_diagonal(pairs, ramps)
+    diagonal = combine_diagonal(pairs, ramps, cluster_strides(window, ks))
     return NoiseTables(thin_factors(ks), columns, weight, sample_squares(rate), diagonal)
 
 

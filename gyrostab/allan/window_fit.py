@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaincc, gammaincinv
 
 from gyrostab.allan.variance import variance_columns, white_freedoms
+from gyrostab.kernels.allan.clusters import cluster_strides
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compile_ahead import await_compilation
 from gyrostab.kernels.fit.autocovariance import STOCHASTIC
@@ -71,7 +72,8 @@ class FitTables:
         self.to_samples = sample_squares(rate)
         self.pairs, self.ramps = product_tables(window, ks, variance=variance)
         diagonal = np.einsum("abii->abi", self.pairs)
-        self.diagonal = combine_diagonal(diagonal, np.einsum("aii->ai", self.ramps))
+        ramps = np.einsum("aii->ai", self.ramps)
+        self.diagonal = combine_diagonal(diagonal, ramps, cluster_strides(window, ks))
         self._detrend = partial(
             detrend_tables, window, ks, self.pairs, self.ramps, summed=VARIANCES[variance].summed
         )

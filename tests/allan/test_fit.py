@@ -732,6 +732,33 @@ def test_trend_of_noise_through_gaps_is_no_ramp(kind):
     assert float((NORMAL_95 * product.R_stderr >= product.R).mean()) >= 0.94
 
 
+@pytest.mark.parametrize("loss", ["10 % one by one", "30 % in bursts", "last 70 %"])
+def test_intervals_hold_where_strong_quantization_noise_meets_gaps(loss):
+    """The jumps across the gaps are one sample at all averaging times, and clusters are thinned."""
+    Q = {"10 % one by one": 2.0, "30 % in bursts": 5.0, "last 70 %": 10.0}[loss]
+    rng = np.random.default_rng([45, len(loss)])
+    x = white(rng, 400, 4000, N=0.01, rate=RATE) + quantization(rng, 400, 4000, Q=Q, rate=RATE)
+    if loss == "last 70 %":
+        x[:, 1200:] = np.nan
+    else:
+        x = lose(rng, x, *((0.1, 1) if loss.startswith("10") else (0.3, 50)))
+    surface = windows_of(x, taus=24)
+    product = fit_noise(surface, tau_min="all", observed_only=False)
+    assert float((chi2.sf(product.fit_chi2, product.fit_dof) < 1e-3).mean()) <= 0.02
+    for term, true in (("Q", Q), ("N", 0.01)):
+        assert (
+            float((abs(product[term] - true) <= NORMAL_95 * product[f"{term}_stderr"]).mean())
+            >= 0.94
+        )
+        assert float((product[f"{term}_upper"] < true).mean()) <= 0.07
+    assert float((product.observable.sel(term=["B", "K", "R"]) == 2).mean()) <= 0.01
+    law = surface.quantization_response * model_avar(surface.tau, {"Q": Q})
+    law = law + surface.white_response * model_avar(surface.tau, {"N": 0.01})
+    limits = confidence_interval(product)
+    hit = ((limits.avar_lower <= law) & (law <= limits.avar_upper)).where(surface.avar.notnull())
+    assert float(hit.mean(("axis", "time")).min()) >= 0.9
+
+
 def test_angles_on_both_sides_of_a_gap_give_its_rate():
     """Errors of an angle cancel in the trend, so that a lost angle adds hardly any scatter."""
     rng = np.random.default_rng(44)

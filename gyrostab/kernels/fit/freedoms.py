@@ -9,12 +9,19 @@ from numpy.typing import NDArray
 from gyrostab.kernels.compiled import INNER, KERNEL
 
 
-def combine_diagonal(pairs: NDArray[np.float64], ramps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Combine the diagonals (4, 4, n_tau) and (4, n_tau) of `product_tables`: (n_tau, 14)."""
+def combine_diagonal(
+    pairs: NDArray[np.float64], ramps: NDArray[np.float64], strides: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Combine the diagonals (4, 4, n_tau) and (4, n_tau) of `product_tables`: (n_tau, 15).
+
+    Last is what the `strides` of pairs of clusters add to the product of quantization noise with
+    itself, which has a covariance at single lags only.
+    """
     columns: list[NDArray[np.float64]] = []
     for a in range(4):
         columns += [pairs[a, b] * (1.0 if a == b else 2.0) for b in range(a, 4)]
         columns.append(ramps[a])
+    columns.append((strides - 1.0) * pairs[0, 0])
     return np.stack(columns, axis=1)
 
 
@@ -42,6 +49,11 @@ def degrees_of_freedom(squares, curves, w, columns, to_samples, diagonal, out): 
             for b in range(a, 5):
                 variance += amounts[a] * amounts[b] * diagonal[i, table]
                 table += 1
+        # see `gyrostab.kernels.fit.mixture.describe_gaps`
+        jumps = squares[0] ** 2 * excess * columns[i, 0] / columns[i, 1] * to_samples[1] ** 2
+        variance += jumps * diagonal[i, 5] * factor[i]
+        if white[i] > 1.0:
+            variance += amounts[0] ** 2 * diagonal[i, 14]
         out[i] = 2.0 * mean * mean / variance * factor[i] if variance > 0.0 else 0.0
 
 
@@ -55,7 +67,7 @@ def cell_freedoms(squares, curves, columns, to_samples, diagonal):  # type: igno
         Squared coefficients.
     curves, columns, to_samples
         As for `identify_noise`.
-    diagonal : float64 (n_tau, 14)
+    diagonal : float64 (n_tau, 15)
         Result of `combine_diagonal`.
 
     Returns

@@ -29,9 +29,11 @@ from gyrostab.kernels.fit.mixture import (
     DATA,
     PRODUCTS,
     WIDTH,
+    add_gaps,
     combine_products,
     compress_products,
     covariance_rows,
+    describe_gaps,
     observe,
     root_squares,
     root_units,
@@ -43,13 +45,15 @@ _ONE, _STOCHASTIC, _TERMS, _MATRIX, _SCRATCH = (np.int64(size) for size in (1, 4
 
 
 class _Cells(NamedTuple):
-    """What `observe` says of eight windows."""
+    """What `observe` and `describe_gaps` say of eight windows."""
 
     system: NDArray[np.float64]
     responses: NDArray[np.float64]
     inverse: NDArray[np.float64]
     avar: NDArray[np.float64]
     excess: NDArray[np.float64]
+    jumps: NDArray[np.float64]
+    thinned: NDArray[np.float64]
     #: Variance of the trend per squared coefficient (rows 0 to 3), and the squared trend (4).
     trend: NDArray[np.float64]
 
@@ -72,6 +76,8 @@ def _make_cells(size):  # type: ignore[no-untyped-def]
         eights(size),
         eights(size),
         eights(_ONE),
+        eights(size),
+        eights(size),
         eights(_TERMS),
     )
 
@@ -181,6 +187,8 @@ def _factor_covariance(cells, basis, state, units, roots, augmented, tables):  #
     needs_retry = True
     while needs_retry:
         covariance_rows(roots, inverse, tables, augmented, width)
+        if _has_positive(cells.excess, np.int64(0)):
+            add_gaps(cells, take(basis, 0), augmented, width)
         jitter = take(state, 2)
         for i in range(n):
             at, y = width * i, take(cells.avar, i)
@@ -329,8 +337,8 @@ def fit_windows(  # type: ignore[no-untyped-def]
         Squared coefficient to sample units.
     pairs : float64 (4, 4, n_tau, n_tau); ramps : float64 (4, n_tau, n_tau)
         `detrend_tables`, or `product_tables` if a ramp is not fitted.
-    diagonal : float64 (n_tau, 14)
-        Products of the Allan variances with themselves, for their degrees of freedom.
+    diagonal : float64 (n_tau, 15)
+        Result of `combine_diagonal`.
     weight : float64 (n_tau,)
         Degrees of freedom for white noise, the weights of the first pass.
     allowed : int
@@ -361,6 +369,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
     stochastic = allowed & 15
     for first in range(0, n_windows, PLACES):
         _observe_eight(first, curves, columns, to_samples, cells, trend, valid)
+        describe_gaps(columns, to_samples, diagonal, cells)
         root_units(cells.responses, units)
         _fit_diagonal(cells, weight, stochastic, fit)
         state = _refit_windows(stochastic, cells, fit, units, augmented, tables)

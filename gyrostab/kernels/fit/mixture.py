@@ -114,6 +114,56 @@ def observe(curves, w, size, trend, columns, to_samples, place, cells):  # type:
 
 
 @njit(**INNER)
+def describe_gaps(columns, to_samples, diagonal, cells):  # type: ignore[no-untyped-def]
+    """Describe what gaps add to the scatter of quantization noise, per squared coefficient.
+
+    In place of the errors that cancel within a run, every gap adds the difference of the errors at
+    its ends. The sample of these jumps is the same at all averaging times, and their mean square
+    scatters as that of `(quantization - 1) weight` normal variables, for `weight` degrees of
+    freedom of white noise: its standard deviation goes to ``cells.jumps``. Clusters are compared at
+    intervals that lose no white noise, but that leave fewer independent errors: the variance that
+    this adds to single cells goes to ``cells.thinned``.
+    """
+    for i in range(columns.shape[0]):
+        white_jump = columns[i, 0] / columns[i, 1] * to_samples[1] * diagonal[i, 5]
+        put(cells.jumps, i, root(take(cells.responses, WIDTH * i + 2) * white_jump))
+        own = take(cells.responses, WIDTH * i)
+        thinned = own * own * diagonal[i, 14] * take(cells.inverse, i)
+        white = take(cells.responses, WIDTH * i + 1)  # above that of unbroken runs for clusters
+        put(cells.thinned, i, where_above(white, to_samples[1], thinned, 0.0))
+
+
+@njit(**INNER)
+def add_gaps(cells, quantization, out, width):  # type: ignore[no-untyped-def]
+    """Add the scatter of `describe_gaps` to `covariance_rows`, for a squared coefficient of Q."""
+    square = quantization * quantization
+    for i in range(cells.inverse.shape[0]):
+        at, jump = width * i, square * take(cells.jumps, i)
+        put(out, at + i, take(out, at + i) + square * take(cells.thinned, i))
+        for j in range(i, cells.inverse.shape[0]):
+            put(out, at + j, take(out, at + j) + jump * take(cells.jumps, j))
+
+
+@njit(**INNER)
+def _compress_gaps(cells, rows, out):  # type: ignore[no-untyped-def]
+    """Add the scatter of `describe_gaps` to the product of Q with itself in four weighted sums."""
+    sums = eights(np.int64(4))
+    for i in range(cells.inverse.shape[0]):
+        entry, jump, thinned = 0, take(cells.jumps, i), take(cells.thinned, i)
+        for c in range(4):
+            row = take(rows, 4 * i + c)
+            put(sums, c, take(sums, c) + row * jump)
+            for d in range(c, 4):
+                put(out, entry, take(out, entry) + thinned * row * take(rows, 4 * i + d))
+                entry += 1
+    entry = 0
+    for c in range(4):
+        for d in range(c, 4):
+            put(out, entry, take(out, entry) + take(sums, c) * take(sums, d))
+            entry += 1
+
+
+@njit(**INNER)
 def root_units(responses, units):  # type: ignore[no-untyped-def]
     """Compute the roots of unit squared coefficients in sample units: row ``5 cell + term``."""
     for i in range(responses.shape[0] // 6):
@@ -251,6 +301,7 @@ def compress_products(cells, rows, units, tables, has_excess, out):  # type: ign
             _add_products(rows, first, second, inverse, tables, table, 1.0, scaled, out, 10 * table)
     if not has_excess:
         return
+    _compress_gaps(cells, rows, out)
     excess = roots[n * 5 : n * 6]
     square_table, at = np.int64(_TABLE[1][1]), np.int64(0)
     _add_products(rows, excess, excess, inverse, tables, square_table, 1.0, scaled, out, at)

@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 
+from gyrostab.kernels.allan.clusters import cluster_strides
 from gyrostab.kernels.fit import lanes
 from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.freedoms import combine_diagonal
@@ -41,7 +42,7 @@ def test_plain_numba_gives_the_fit_of_the_vectors(tmp_path):
     gaps = [rng.uniform(0.9, 1.1, avar.shape) for _ in range(4)]
     pairs, ramps = product_tables(window, ks)
     diagonal = combine_diagonal(
-        np.einsum("abii->abi", pairs).copy(), np.einsum("aii->ai", ramps).copy()
+        np.einsum("abii->abi", pairs), np.einsum("aii->ai", ramps), cluster_strides(window, ks)
     )
     trend = rng.uniform(0.0, 1e-3, (11, 6))
     squares = sample_squares(rate)
