@@ -16,6 +16,7 @@ from gyrostab.kernels.spectra.line_levels import EDGE_LINES, LEAK_LINES, level_a
 Array = NDArray[Any]
 _MIN_LEVEL_RATIO = 1e-3  # of the spectrum, that known lines leave; design choice
 _MAX_SKIRT_LINES = 40  # design choice
+_POWERS_AT_ONCE = 100_000  # of null records; so many fit in the cache of a processor
 
 
 def expected_lines(baseline: xr.Dataset, frequency: Array) -> Array:
@@ -56,20 +57,20 @@ def line_evidence(power: Array, weight: Array, expected: Array | None = None) ->
     usable = (weight > 0) & np.isfinite(power).all(axis=(0, 3))
     share = np.where(usable, weight, 0.0)[..., None]
     slope = np.ones(power.shape[-1]) if expected is None else expected[:, None]
-    clean = np.where(usable[..., None], power / slope, 1.0)
-    level = level_around(clean)
-    evidence_nats = np.zeros((*power.shape[:2], power.shape[-1]))
-    above, precision = clean - level, share / level**2
-    for number in range(FOLDS):
-        held = np.arange(power.shape[2]) % FOLDS == number
-        trained = precision[:, :, ~held]
-        total = np.maximum(trained.sum(axis=2, keepdims=True), 1e-300)
-        square = (above[:, :, ~held] * trained).sum(axis=2, keepdims=True) / total
-        square = np.maximum(square, 0.0)
-        ratio, excess = clean[:, :, held] / level[:, :, held], square / level[:, :, held]
-        evidence_nats += (
-            share[:, held] * (ratio * excess / (1.0 + excess) - np.log1p(excess))
-        ).sum(axis=2)
+    fold = np.arange(power.shape[2]) % FOLDS
+    in_training = (fold != np.arange(FOLDS)[:, None]).astype(float)  # (fold, part)
+    evidence_nats = np.empty((*power.shape[:2], power.shape[-1]))
+    at_once = max(1, _POWERS_AT_ONCE // power[0].size)
+    for first in range(0, len(power), at_once):
+        records = slice(first, first + at_once)
+        clean = np.where(usable[..., None], power[records] / slope, 1.0)
+        level = level_around(clean)
+        precision = share / level**2
+        total = np.maximum(in_training @ precision, 1e-300)  # by record, axis, fold, line
+        square = np.maximum(in_training @ ((clean - level) * precision) / total, 0.0)
+        excess = square[:, :, fold] / level
+        nats = share * (clean / level * excess / (1.0 + excess) - np.log1p(excess))
+        evidence_nats[records] = nats.sum(axis=2)
     evidence_nats[..., :EDGE_LINES] = -np.inf
     return np.asarray(evidence_nats - np.log(power.shape[3]))
 

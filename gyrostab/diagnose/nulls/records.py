@@ -335,8 +335,10 @@ def _draw_lines(setup: _NullSetup, squares: Array, rng: np.random.Generator) -> 
         out[:, axis, part] = (share * plain[:, axis] + (1.0 - share) * flat[:, axis]) * effects
         if "peaks" in baseline:
             out[:, axis, part] += baseline["peaks"].values[axis]
-    drawn = _draw_gamma(weight[..., None], np.ones(out.shape), rng)
-    return _correlate_lines(drawn, int(blocks.attrs["block_samples"])) * out
+    for record in out:  # one after the other: they may have many lines
+        drawn = _draw_gamma(weight[..., None], np.ones(record.shape), rng)
+        record *= _correlate_lines(drawn, int(blocks.attrs["block_samples"]))
+    return out
 
 
 def _correlate_lines(drawn: Array, size: int) -> Array:

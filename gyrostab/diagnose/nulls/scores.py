@@ -14,7 +14,8 @@ from gyrostab.diagnose.statistics import STATISTICS
 
 Array = NDArray[np.float64]
 _KEPT_BELOW_SIGMA = 1.4  # below the largest of independent cells, from which scores are kept
-_POWERS_AT_ONCE = 1_000_000  # band powers of null records scored at once; limits memory
+#: Powers of null records, in bands or at lines, that are scored at once; limits memory.
+_POWERS_AT_ONCE = 1_000_000
 _MIN_RECORDS_AT_ONCE = 20  # null records for the first estimate of a standard deviation
 _MIN_TAIL_SCALE = 0.7  # of half a squared score; that of a single normal cell is 1
 _MIN_EVIDENCE_SCALE = 0.1  # [nats]; keeps the tail from vanishing when null records score alike
@@ -91,8 +92,8 @@ def null_scores(
     records = 0
     for chunk in nulls:
         records += chunk.sizes["record"]
-        size = _POWERS_AT_ONCE * chunk.sizes["record"] // chunk["power"].size
-        size = max(_MIN_RECORDS_AT_ONCE, size)
+        powers = max(chunk["power"].size, chunk["line_power"].size) // chunk.sizes["record"]
+        size = max(_MIN_RECORDS_AT_ONCE, _POWERS_AT_ONCE // powers)
         for first in range(0, chunk.sizes["record"], size):
             part = chunk.isel(record=slice(first, first + size))
             for statistic in STATISTICS:

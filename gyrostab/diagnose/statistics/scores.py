@@ -71,17 +71,19 @@ def part_windows(blocks: xr.Dataset) -> Windows:
 
 def cumulative(values: Any, axis: int = -1) -> Any:
     """Return cumulative sums over a dimension, by default the last one, from 0."""
-    before = np.zeros(values.ndim, np.int64)
-    before[axis] = 1
-    return np.pad(np.cumsum(values, axis=axis), np.stack([before, 0 * before], axis=1))
+    shape, after = list(values.shape), [slice(None)] * values.ndim
+    shape[axis] += 1
+    after[axis] = slice(1, None)
+    total = np.zeros(shape, np.result_type(values, np.int64))
+    np.cumsum(values, axis=axis, out=total[tuple(after)])
+    return total
 
 
 def moving_sum(values: Array, span: int) -> Array:
     """Return sums over `span` places of the last dimension around each, fewer at the ends."""
-    total = cumulative(values)
-    low = np.arange(values.shape[-1]) - span // 2
-    high = np.minimum(low + span, values.shape[-1])
-    return np.asarray(total[..., high] - total[..., np.maximum(low, 0)])
+    ends = [(0, 0)] * (values.ndim - 1) + [(span // 2, span - 1 - span // 2)]
+    total = cumulative(np.pad(values, ends))
+    return np.asarray(total[..., span:] - total[..., :-span])
 
 
 def sum_over_windows(values: Any, windows: Windows, *, axis: int = -2) -> Any:

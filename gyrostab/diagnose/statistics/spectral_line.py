@@ -251,7 +251,7 @@ def _mean_around(flat: Array) -> Array:
     total = cumulative(flat)
     width = min(2 * _AROUND_LINES + _WIDTH_LINES, n)
     low = np.clip(np.arange(n) - width // 2, 0, n - width)
-    outer = total[..., low + width] - total[..., low]
+    outer = np.take(total, low + width, axis=-1) - np.take(total, low, axis=-1)
     inner, count = moving_sum(flat, _WIDTH_LINES), moving_sum(np.ones(n), _WIDTH_LINES)
     return np.asarray((outer - inner) / np.maximum(width - count, 1.0))
 

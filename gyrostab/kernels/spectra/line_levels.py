@@ -38,12 +38,12 @@ def level_around(power: Array, lines: int = _LEVEL_LINES, side: int = _SIDE_LINE
     group_count = count // side
     if group_count < 3:
         return level
-    medians = np.median(
-        power[..., : group_count * side].reshape(*power.shape[:-1], group_count, side), axis=-1
+    medians = _find_median(
+        power[..., : group_count * side].reshape(*power.shape[:-1], group_count, side)
     )
     group = np.minimum(np.arange(count) // side, group_count - 1)
-    right = medians[..., np.minimum(group + 1, group_count - 1)]
-    left = medians[..., np.maximum(group - 1, 0)]
+    right = np.take(medians, np.minimum(group + 1, group_count - 1), axis=-1)
+    left = np.take(medians, np.maximum(group - 1, 0), axis=-1)
     # The first lines have only the lines below them.
     below = np.cumsum(power[..., :side], axis=-1) / np.arange(1, side + 1)
     left[..., :side] = below[..., np.maximum(np.arange(side) - LEAK_LINES, 0)]
@@ -64,12 +64,22 @@ def local_level(total: Array, lines: int = _LEVEL_LINES) -> Array:
     count = total.shape[-1]
     ends = np.linspace(0, count, max(1, count // lines) + 1).astype(int)
     medians = np.stack(
-        [np.median(total[..., low:high], axis=-1) for low, high in pairwise(ends)], axis=-1
+        [_find_median(total[..., low:high]) for low, high in pairwise(ends)], axis=-1
     )
     middle = (ends[1:] + ends[:-1] - 1) / 2.0
     place = np.clip(
         np.interp(np.arange(count), middle, np.arange(middle.size)), 0.0, middle.size - 1.0
     )
     low = np.minimum(place.astype(int), max(middle.size - 2, 0))
-    high = np.minimum(low + 1, middle.size - 1)
-    return np.asarray(medians[..., low] + (place - low) * (medians[..., high] - medians[..., low]))
+    below = np.take(medians, low, axis=-1)
+    above = np.take(medians, np.minimum(low + 1, middle.size - 1), axis=-1)
+    return np.asarray(below + (place - low) * (above - below))
+
+
+def _find_median(values: Array) -> Array:
+    """Find the median over the last dimension; of tens of values, faster than `numpy.median`."""
+    ordered, half = np.sort(values, axis=-1), values.shape[-1] // 2
+    middle = ordered[..., half]
+    if values.shape[-1] % 2 == 0:
+        middle = (ordered[..., half - 1] + middle) / 2.0
+    return np.asarray(np.where(np.isnan(ordered[..., -1]), np.nan, middle))

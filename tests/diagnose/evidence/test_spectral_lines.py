@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +27,7 @@ from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.diagnose.statistics.spectral_line import estimate_line
 from gyrostab.ingest.make_log import make_log
+from gyrostab.kernels.spectra.line_levels import local_level
 from tests.support.candidates import find_components
 from tests.support.named import name_effects, nulls
 
@@ -45,6 +47,25 @@ def test_slopes_and_humps_are_not_lines() -> None:
     for density in (place**-2.0, place**2.0, 1.0 + 50.0 * np.exp(-(((place - 90.0) / 15.0) ** 2))):
         evidence_nats = line_evidence(spectra(density[None]), WEIGHT)
         assert evidence_nats.max(axis=-1).max() < 8.0  # of 12 000 lines
+
+
+def test_many_records_have_the_evidence_of_each_alone_in_little_memory() -> None:
+    power = spectra(np.ones((1, 400)), records=300)
+    alone = np.concatenate([line_evidence(record[None], WEIGHT) for record in power])
+    tracemalloc.start()
+    together = line_evidence(power, WEIGHT)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    np.testing.assert_allclose(together, alone, rtol=1e-12)
+    assert peak < 1.5 * power.nbytes  # all records at once need several times as much
+
+
+@pytest.mark.parametrize("lines", [7, 8])
+def test_levels_are_medians_of_intervals(lines: int) -> None:
+    power = np.random.default_rng(4).exponential(size=(2, 3, lines))
+    power[0, 1, 2] = np.nan
+    expected = np.median(power, axis=-1)
+    np.testing.assert_array_equal(local_level(power, lines)[..., 0], expected)
 
 
 def test_an_intermittent_line_is_not_steady() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -238,6 +239,17 @@ def test_the_same_generator_gives_the_same_records():
         for _ in range(2)
     )
     xr.testing.assert_identical(first, second)
+
+
+def test_drawing_many_lines_needs_little_memory_besides_the_records():
+    log = simulate({"log": {"axes": ["x"]}, "noise": NOISE}, duration="10min", rate=400.0, seed=1)
+    record = reduce_log(log)
+    baseline = calibrate_noise(record)
+    tracemalloc.start()
+    nulls = next(null_records(record, baseline, count=200, chunk=200, rng=np.random.default_rng(5)))
+    kept, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak - kept < nulls["line_power"].nbytes
 
 
 def candidates(record: xr.Dataset) -> tuple[dict, dict]:

@@ -19,6 +19,7 @@ from gyrostab.diagnose.statistics.restart import _restart_blocks
 from gyrostab.diagnose.statistics.scores import (
     cube_root_score,
     exponential_score,
+    moving_sum,
     sum_over_windows,
     window_set,
 )
@@ -55,6 +56,16 @@ def _dense_covariance(variance, present, walk, ou, decay):
         decays = np.concatenate([[0.0], np.cumsum(np.log(decay[:-1, i]))])
         dense += ou[i] * np.exp(-np.abs(np.subtract.outer(decays, decays)))
     return dense[np.ix_(present, present)]
+
+
+@pytest.mark.parametrize("span", [1, 4, 5, 20])
+def test_moving_sums_have_fewer_places_at_the_ends(span):
+    values = np.random.default_rng(2).integers(0, 2, (2, 9)).astype(bool)
+    expected = [
+        [row[max(place - span // 2, 0) : place - span // 2 + span].sum() for place in range(9)]
+        for row in values
+    ]
+    np.testing.assert_array_equal(moving_sum(values, span), expected)
 
 
 def test_boxcar_kernels_match_dense_algebra():
