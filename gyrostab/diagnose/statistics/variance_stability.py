@@ -73,14 +73,15 @@ class VarianceStability(Statistic):
         if not spans or not used.any():
             return None
         members = _band_groups(int(used.sum()))
-        level, weight, rows = _relative_levels(blocks, baseline, used, members)
+        levels, rows = _relative_levels(blocks, baseline, used, members)
         windows = window_set(block_count, LENGTHS)
-        scatter = [
-            _score_scatter(level, weight, windows, span, single=int(used.sum())) for span in spans
+        single = int(used.sum())
+        scores = [
+            [_score_scatter(*of_rows, windows, span, single=single) for span in spans]
+            for of_rows in levels
         ]
-        z, ratio, variation = (
-            np.concatenate([span_scores[place] for span_scores in scatter], axis=-1)
-            for place in range(3)
+        z, ratio, variation = np.concatenate(
+            [np.concatenate(of_spans, axis=-1) for of_spans in scores], axis=-3
         )
         f_low = np.append([low[used][group].min() for group in members], low[used][0])
         f_high = np.append([high[used][group].max() for group in members], high[used][-1])
@@ -186,10 +187,11 @@ def _relative_levels(
     baseline: xr.Dataset,
     used: NDArray[np.bool_],
     members: list[NDArray[np.int64]],
-) -> tuple[Array, Array, list[str]]:
-    """Return the level over that of the record, its shape, and the axes of each row.
+) -> tuple[list[tuple[Array, Array]], list[str]]:
+    """Return the level over that of the record, with its shape, and the axes of each row.
 
-    By (record), row, block, group of bands.
+    By (record), row, block, group of bands: one pair for all axes, whose shapes all records have in
+    common, and one for the row of several axes.
     """
     power, spectrum = blocks["power"].values, baseline["spectrum"].values
     shape = blocks["shape"].values[..., used]
@@ -197,7 +199,7 @@ def _relative_levels(
         shape = shape * baseline["shape_factor"].values[used]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = (power / spectrum)[..., used]
-        present = np.isfinite(ratio) & (shape > 0)
+        present = np.isfinite(ratio).reshape(-1, *shape.shape).all(axis=0) & (shape > 0)
         used_shape = np.where(present, shape, 0.0)
         ratio = ratio * _limit_noisy_blocks(np.where(present, ratio, 0.0), used_shape)
         weighted = np.where(present, ratio * used_shape, 0.0)
@@ -210,16 +212,12 @@ def _relative_levels(
     axes = [str(axis) for axis in blocks["axis"].values]
     level = np.nan_to_num(level)
     if len(axes) == 1:
-        return level, weight, axes
+        return [(level, weight)], axes
     joint_weight = weight.sum(axis=-3, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = np.nan_to_num((level * weight).sum(axis=-3, keepdims=True) / joint_weight)
     joint_weight = joint_weight / _coherence_factor(blocks, used, members, weight)
-    return (
-        np.concatenate([level, mean], axis=-3),
-        np.concatenate([weight, joint_weight], axis=-3),
-        [*axes, " ".join(axes)],
-    )
+    return [(level, weight), (mean, joint_weight)], [*axes, " ".join(axes)]
 
 
 def _limit_noisy_blocks(ratio: Array, shape: Array) -> Array:
@@ -283,12 +281,13 @@ def _score_scatter(
     The single bands come first.
     """
     count = level.shape[-2] // span
-    shape = np.broadcast_to(weight, level.shape)[..., : count * span, :].reshape(
-        *level.shape[:-2], count, span, -1
+    level, shape = (
+        values[..., : count * span, :].reshape(*values.shape[:-2], count, span, -1)
+        for values in (level, weight)
     )
     total = shape.sum(axis=-2)
     with np.errstate(divide="ignore", invalid="ignore"):
-        average = (level[..., : count * span, :].reshape(shape.shape) * shape).sum(axis=-2) / total
+        average = (level * shape).sum(axis=-2) / total
         middle = _robust_mean(average, total)
         average = np.clip(average, None, middle * (1.0 + _MAX_AVERAGE_SIGMA / np.sqrt(total)))
         present = total > 0

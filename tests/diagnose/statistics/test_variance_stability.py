@@ -69,6 +69,14 @@ def test_scores_of_steady_noise_are_normal(base):
     assert 0.4 < (z > 3.0).mean() / 0.00135 < 2.5
 
 
+def test_records_have_the_same_scores_together_as_alone(base):
+    drawn = _some_records(base, 3, 4)
+    drawn["power"][:, 1, 40:47] = np.nan
+    statistic = find_statistic("variance_stability")
+    alone = [statistic.score(drawn.isel(record=[number]), base) for number in range(3)]
+    xr.testing.assert_allclose(statistic.score(drawn, base), xr.concat(alone, "record"), rtol=1e-12)
+
+
 def test_detection_limit_of_variance_fluctuation(base, null):
     shape = float(_some_records(base, 1, 1)["shape"].values[0, 0, 3:].sum())
     swell = np.sqrt(2.0) * np.sin(
