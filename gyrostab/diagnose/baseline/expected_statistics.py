@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import xarray as xr
@@ -23,11 +24,17 @@ def line_columns(blocks: xr.Dataset) -> Array:
 
     In degree2 hour-2 Hz-1 per squared unit of the noise table.
     """
-    size, rate = int(blocks.attrs["block_samples"]), float(blocks.attrs["sampling_rate_hz"])
-    return np.asarray(
-        expected_powers(taper(size), rate, ordinates(size)).T
-        * np.array([LAWS[term].seconds_factor for term in NOISE])
-    )
+    size, rate = blocks.attrs["block_samples"], blocks.attrs["sampling_rate_hz"]
+    return _line_columns(int(size), float(rate))
+
+
+@lru_cache(maxsize=4)
+def _line_columns(size: int, rate: float) -> Array:
+    """Compute the array of `line_columns`, which a diagnosis needs a hundred times; read-only."""
+    powers = expected_powers(taper(size), rate, ordinates(size)).T
+    columns = np.asarray(powers * np.array([LAWS[term].seconds_factor for term in NOISE]))
+    columns.flags.writeable = False
+    return columns
 
 
 def band_columns(blocks: xr.Dataset) -> Array:

@@ -9,6 +9,7 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.expected_statistics import (
     common_variance,
+    line_columns,
     noise_powers,
     white_variance,
 )
@@ -99,6 +100,16 @@ def test_coefficients_are_within_their_errors(lost):
     assert float(baseline["stderr"].sel(term="N").max()) < 0.05 * noise["N"]
     level = (blocks["power"] / baseline["spectrum"]).mean(["axis", "block"])
     np.testing.assert_allclose(level, 1.0, atol=0.12)
+
+
+def test_powers_of_lines_are_computed_once_for_a_size_and_rate():
+    blocks = xr.Dataset(attrs={"block_samples": 64, "sampling_rate_hz": 10.0})
+    columns = line_columns(blocks)
+    assert line_columns(blocks.copy()) is columns
+    with pytest.raises(ValueError, match="read-only"):
+        columns[0] = 0.0
+    slower = line_columns(blocks.assign_attrs(sampling_rate_hz=5.0))
+    np.testing.assert_allclose(slower[:, 3], 4.0 * columns[:, 3])  # a walk falls as 1 / f^2
 
 
 def test_white_variance_is_that_of_block_means():
