@@ -37,6 +37,7 @@ from gyrostab.diagnose.evidence.products import (
     power_products,
     remove_common_part,
 )
+from gyrostab.diagnose.evidence.wandering import RandomProcesses
 from gyrostab.diagnose.reduce.schema import axis_values
 
 #: "free": the noise may differ from the calibrated one (to name an effect); "calibrated": it is the
@@ -74,6 +75,7 @@ def mean_factors(
     tier: Tier = "free",
     given: Array | None = None,
     folds: xr.DataArray | None = None,
+    wander: RandomProcesses | None = None,
 ) -> Array:
     """Compute factors of designs in the block means of an axis, one record or many of equal gaps.
 
@@ -83,6 +85,8 @@ def mean_factors(
         Columns in any unit.
     given : ndarray, shape (block, column), optional
         Columns in the model with and without the design (effects already named).
+    wander : RandomProcesses, optional
+        Random processes in the means; those of the baseline by default.
 
     Returns
     -------
@@ -102,9 +106,11 @@ def mean_factors(
     numbers, design_width = _number_columns(flat), columns.shape[1] - columns_given.shape[1]
     present = np.asarray(np.isfinite(values).all(axis=1))
     setup = axis_noise(baseline, axis) | {
-        "step": float(data["end"][0] - data["begin"][0]),
+        "step": float(data["end"].values[0] - data["begin"].values[0]),
         "pairs": column_pairs(columns.shape[1], numbers, columns_given.shape[1]),
     }
+    if wander is not None:
+        setup["wander"] = wander
     white = mean_products(
         values[:, :0],
         columns,

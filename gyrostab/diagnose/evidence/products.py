@@ -119,18 +119,18 @@ def mean_products(
     stacked[~present] = 0.0
     spread = np.where(present, variance, 1.0)
     share, time, white = flicker_states(step, n * step)
-    steps, walk = np.full(n, step), np.zeros(n)
-    if wander is not None:
-        walk = walk + wander.walk
+    steps = np.full(n, step)
+    if wander is None:
+        wander = RandomProcesses(np.empty(0), np.empty(0), np.zeros(n))
+    squares, times = np.append(share, wander.square), np.append(time, wander.time)
     shape = (K.size, values.shape[1])
     square, cross = np.empty(shape), np.empty((K.size, width, shape[1]))
     gram, determinant = np.zeros((K.size, width, width)), np.empty(K.size)
     for g, (k, b) in enumerate(zip(K**2 / HOUR, B**2, strict=True)):
-        states = (share * b, time) if b > 0.0 else (share[:0], time[:0])
-        if wander is not None:
-            states = (np.append(states[0], wander.square), np.append(states[1], wander.time))
+        squares[: share.size] = share * b
+        used = slice(0 if b > 0.0 else share.size, None)
         whitened, determinant[g] = whiten(
-            stacked, spread + b * white, steps, present, k + walk, *states
+            stacked, spread + b * white, steps, present, k + wander.walk, squares[used], times[used]
         )
         x, y = whitened[:, :width], whitened[:, width:]
         cross[g], square[g] = x.T @ y, np.einsum("ij,ij->j", y, y)

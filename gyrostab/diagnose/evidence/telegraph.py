@@ -284,7 +284,7 @@ def telegraph_evidence(
     present = np.asarray(np.isfinite(values).all(axis=1)) & np.isfinite(variance)
     n = present.size
     scaled_given = scale_columns(given, n)
-    setup |= {"step": float(data["end"][0] - data["begin"][0]), "present": present}
+    setup |= {"step": float(data["end"].values[0] - data["begin"].values[0]), "present": present}
     log_weight = axis_values(baseline, "grid_prior", axis)
     safe = np.where(present[:, None], values, 0.0)
     evidence_nats, attempts = [], []

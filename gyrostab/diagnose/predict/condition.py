@@ -118,14 +118,13 @@ def drop_changed_tails(
     unusual = turns | (
         np.abs(level - np.median(level, axis=1, keepdims=True)) > settings.max_level_step
     )
+    out = blocks.copy()
+    left_out: dict[str, tuple[NDArray[np.bool_], float]]
     left_out = {"kurtosis": (unusual, np.nan), "outliers": (turns, 0)}
-    return blocks.assign(
-        {
-            name: blocks[name].copy(data=np.where(where, replacement, blocks[name].values))
-            for name, (where, replacement) in left_out.items()
-            if name in blocks
-        }
-    )
+    for name, (where, replacement) in left_out.items():
+        if name in out:
+            out[name].values = np.where(where, replacement, out[name].values)
+    return out
 
 
 _ROUNDS = 4  # steps of Fisher scoring

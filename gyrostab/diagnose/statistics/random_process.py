@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.posterior import visible_coefficients
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.held_out import Tier, mean_factors
-from gyrostab.diagnose.evidence.wandering import with_process
+from gyrostab.diagnose.evidence.wandering import expected_processes, with_process
 from gyrostab.diagnose.predict.average_sizes import plain_places
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
@@ -138,6 +138,7 @@ def _walk_factors(
     Where the channel is most active, the walk is `steps` times that which the means just show.
     """
     baseline, folds = state.baseline, fold_blocks(data).isel(length=slice(0, 0))
+    processes = expected_processes(baseline, axis)
     block, count = float(data.attrs["block_s"]), data.sizes["block"]
     density = block * float(np.nanmedian(baseline["mean_variance"].sel(axis=axis)))
     visible, _ = visible_coefficients(density, block * count)
@@ -146,12 +147,13 @@ def _walk_factors(
     def log_evidence(walk: Array) -> Array:
         factors = mean_factors(
             data,
-            with_process(baseline, axis, walk),
+            baseline,
             [],
             axis=axis,
             tier=tier,
             given=state.given_to("mean", axis),
             folds=folds,
+            wander=processes._replace(walk=processes.walk + walk),
         )
         return np.asarray(factors[0, 0])
 
