@@ -238,11 +238,14 @@ def find_correlated_bias(state: State, axis: str) -> CorrelatedBias | None:
     )
 
 
-def fit_rms(state: State, axis: str, time: float) -> float:
-    """Return the likeliest rms [deg/h] of a bias with this correlation time [s]; 0 if unknown."""
+def fit_rms(state: State, axis: str, time: float) -> float | None:
+    """Find the likeliest rms [deg/h] of a bias with this correlation time [s].
+
+    None as for `find_correlated_bias`.
+    """
     record = _axis_record(state, axis)
     if record is None:
-        return 0.0
+        return None
     low, high = (np.append(ends[:-1], math.log(time)) for ends in (record.low, record.high))
     record = replace(record, low=low, high=high)
     K, B, sizes, _ = record.start_grid()

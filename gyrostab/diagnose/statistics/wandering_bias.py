@@ -99,6 +99,8 @@ class WanderingBias(RandomProcess):
         if _is_calibrated_with(axis, state):
             return state
         rms = _recall_fit(partial(fit_rms, state, axis, time), b"rms", axis, state, np.array(time))
+        if rms is None:
+            return state
         power = correlated_band_powers(state.blocks, time)[None, None]
         column = power_column(power, state.axes.index(axis), state)
         variance = rms**2 * component.variant.design[0]
