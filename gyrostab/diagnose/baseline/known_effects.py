@@ -107,7 +107,7 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
     if narrow:
         variables |= expect_lines(blocks, narrow, white_response[:, 0])
     processes, power = random_means(wandering, shape)
-    white_share = 1.0 - power / spectrum[..., 0]
+    white_share = 1.0 - power / np.maximum(spectrum[..., 0], np.finfo(float).tiny)
     return KnownEffects(mean, spectrum, white_share, variables | processes, left_out)
 
 

@@ -62,9 +62,8 @@ def hidden_by_grid(blocks: xr.Dataset, name: str) -> NDArray[np.bool_]:
     if name not in _PREDICTED_COUNTS or not coarse.any():
         return coarse & (name in GRID_COUNTS)
     by_axis = np.moveaxis(blocks["kurtosis"].values, -2, 0).reshape(coarse.size, -1)
-    kurtosis = np.where(np.isfinite(by_axis).any(axis=1, keepdims=True), by_axis, np.inf)
     scatter = np.sqrt(24.0 / np.maximum(np.median(blocks["samples"].values, axis=-1), 1.0))
-    is_normal = np.nanquantile(kurtosis, _NORMAL_SHARE, axis=1) < _MAX_NORMAL_KURTOSIS * scatter
+    is_normal = _finite_quantile(by_axis, _NORMAL_SHARE) < _MAX_NORMAL_KURTOSIS * scatter
     step = blocks["quantization_step"].values
     return np.asarray(
         coarse & ~(is_normal & (step < _MAX_PREDICTED_SCATTERS * quiescent_scatter(blocks)))
@@ -76,8 +75,13 @@ def quiescent_scatter(blocks: xr.Dataset) -> NDArray[np.float64]:
     width = blocks["band_high"].values - blocks["band_low"].values
     power = blocks["power"].transpose("axis", ..., "band").values
     square = 2.0 * (power @ width).reshape(len(power), -1)
-    known = [row[np.isfinite(row)] for row in square]
-    return np.sqrt([np.quantile(row, _QUIESCENT_QUANTILE) if row.size else np.inf for row in known])
+    return np.sqrt(_finite_quantile(square, _QUIESCENT_QUANTILE))
+
+
+def _finite_quantile(values: NDArray[Any], share: float) -> NDArray[np.float64]:
+    """Return the quantile of the finite values of each row, inf without any."""
+    finite = [row[np.isfinite(row)] for row in values]
+    return np.array([np.quantile(row, share) if row.size else np.inf for row in finite])
 
 
 def excess_extremes(values: NDArray[Any]) -> NDArray[Any]:

@@ -106,6 +106,7 @@ def test_a_simulated_log_is_scaled_to_quiet_time():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_simulation_and_quiet_time_can_be_combined():
     recording = log({"N": 0.003}, duration="15min")
     with pytest.warns(UserWarning, match=r"simulation is multiplied by 1\.[45]\d* on axis x"):

@@ -102,6 +102,7 @@ def test_values_without_a_grid_have_no_step(dtype: type):
             assert quantization_step(3.6 * values.astype(dtype).astype(np.float64)) == 0.0
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_grid_hides_repeats_only_where_noise_is_not_normal():
     normal = reduce_log(log_of(np.round(noise("white") / 0.5) * 0.5))
     bursts = noise("white") * (0.3 + 3.0 * (np.arange(SIZE) // 50 % 8 == 0))
@@ -112,6 +113,8 @@ def test_grid_hides_repeats_only_where_noise_is_not_normal():
     assert hidden_by_grid(normal, "kurtosis").all()
     coarse = reduce_log(log_of(np.round(noise("white") / 2.0) * 2.0))
     assert hidden_by_grid(coarse, "repeats").all()
+    unknown = normal.assign(kurtosis=np.nan * normal["kurtosis"])
+    assert hidden_by_grid(unknown, "repeats").all()
 
 
 @pytest.mark.slow
