@@ -61,9 +61,9 @@ def hidden_by_grid(blocks: xr.Dataset, name: str) -> NDArray[np.bool_]:
     coarse = has_coarse_grid(blocks)
     if name not in _PREDICTED_COUNTS or not coarse.any():
         return coarse & (name in GRID_COUNTS)
-    by_axis = np.moveaxis(blocks["kurtosis"].values, -2, 0).reshape(coarse.size, -1)
-    scatter = np.sqrt(24.0 / np.maximum(np.median(blocks["samples"].values, axis=-1), 1.0))
-    is_normal = _finite_quantile(by_axis, _NORMAL_SHARE) < _MAX_NORMAL_KURTOSIS * scatter
+    in_errors = blocks["kurtosis"].values * np.sqrt(blocks["samples"].values / 24.0)
+    by_axis = np.moveaxis(in_errors, -2, 0).reshape(coarse.size, -1)
+    is_normal = _finite_quantile(by_axis, _NORMAL_SHARE) < _MAX_NORMAL_KURTOSIS
     step = blocks["quantization_step"].values
     return np.asarray(
         coarse & ~(is_normal & (step < _MAX_PREDICTED_SCATTERS * quiescent_scatter(blocks)))

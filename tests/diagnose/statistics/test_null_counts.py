@@ -115,6 +115,11 @@ def test_grid_hides_repeats_only_where_noise_is_not_normal():
     assert hidden_by_grid(coarse, "repeats").all()
     unknown = normal.assign(kurtosis=np.nan * normal["kurtosis"])
     assert hidden_by_grid(unknown, "repeats").all()
+    swings = noise("white") * (0.5 + (np.arange(SIZE) // 50 % 8 == 0))
+    few = reduce_log(log_of(np.round(swings / 0.5) * 0.5))
+    left_out = xr.DataArray(np.arange(few.sizes["block"]) % 3 > 0, dims="block")
+    few["kurtosis"], few["samples"] = few["kurtosis"].where(~left_out), few["samples"] * ~left_out
+    assert hidden_by_grid(few, "repeats").all()
 
 
 @pytest.mark.slow
