@@ -189,6 +189,8 @@ class Effect:
     likeness: ClassVar[Mapping[str, Likeness]] = {}
     is_steady: ClassVar[bool] = False  # whether it acts all the time, with the same size
     follows_axes: ClassVar[bool] = False  # whether it follows the rates of other axes
+    #: Whether it changes samples of all its axes at the same instants.
+    is_simultaneous: ClassVar[bool] = False
     shapes_spectrum: ClassVar[bool] = False  # whether it changes the form of the spectrum
     terms: ClassVar[str] = "QNBK"  # symbols that an effect of the stage "noise" may change
 

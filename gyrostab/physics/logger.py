@@ -188,6 +188,7 @@ class HeldSamples(Effect):
     next_measurement = "log a counter with each sample"
     stage = "logger"
     size_parameters = ("per_hour",)
+    is_simultaneous = True
     shapes_spectrum = True
 
     per_hour: float = parameter(

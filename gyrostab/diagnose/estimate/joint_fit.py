@@ -12,7 +12,7 @@ import xarray as xr
 from scipy.special import ndtr, ndtri
 
 from gyrostab.diagnose.estimate.filter_sizes import fit_filter_sizes
-from gyrostab.diagnose.estimate.split_components import split_harmonics, split_steps
+from gyrostab.diagnose.estimate.split_components import group_axes, split_harmonics, split_steps
 from gyrostab.diagnose.identify.components import axes_of
 from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.predict.candidates import Component
@@ -87,7 +87,7 @@ def fit_identifications(identifications: Identifications, baseline: xr.Dataset) 
     -------
     list of Fitted
         One entry per axis of an effect with a single size for all of its axes; one entry for all
-        axes where each has its own size.
+        axes where each has its own size, or where it changes samples at the same instants.
     """
     return [
         fitted
@@ -128,8 +128,8 @@ def _fit_identification(
         ]
         if fitted_together
         else [
-            ([component for component in identification.components if axis in component.row], state)
-            for axis in identification.axes
+            ([part for part in identification.components if set(axes) & set(part.row)], state)
+            for axes in group_axes(identification, state.blocks, identifications.count_evidence)
         ]
     )
     return [

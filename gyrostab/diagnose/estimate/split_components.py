@@ -1,4 +1,4 @@
-"""Split an effect into components that are fitted apart: harmonics, steps at several times."""
+"""Split an effect into components that are fitted apart: harmonics, steps, independent axes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import xarray as xr
 
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.predict.candidates import TIME_PARAMETER, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on_components
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.statistics.rotation_order import fit_amplitude, harmonic_sets
+from gyrostab.diagnose.statistics.sample_sizes import are_simultaneous
+from gyrostab.physics.registry import effects
 
 MAX_BLOCKS_OF_STEP = 2  # by which the times of a step on two axes may differ; design choice
 
@@ -71,6 +75,31 @@ def split_steps(
         nearest = [_nearest_times(step, [_step_time(other) for other in others]) for step in group]
         out.append((nearest, replace(state, given=with_others.given)))
     return out
+
+
+def group_axes(
+    identification: Selection, blocks: xr.Dataset, count_evidence: CountEvidence
+) -> list[list[str]]:
+    """Group the axes on which an effect changes samples at the same instants; others are alone."""
+    marks = {
+        component.row[0]: component.variant.columns[0]
+        for component in identification.components
+        if component.statistic.is_count and effects()[identification.effect].is_simultaneous
+    }
+    groups: list[list[str]] = []
+    for axis in identification.axes:
+        own = [
+            group
+            for group in groups
+            if axis in marks
+            and marks.get(group[0]) == marks[axis]
+            and are_simultaneous((group[0], axis), marks[axis], blocks, count_evidence)
+        ]
+        if own:
+            own[0].append(axis)
+        else:
+            groups.append([axis])
+    return groups
 
 
 def _group_steps(steps: Sequence[Component], state: State) -> list[list[Component]]:

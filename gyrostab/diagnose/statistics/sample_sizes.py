@@ -207,6 +207,31 @@ def _poisson_interval(count: float) -> tuple[float, float]:
     return float(gammaincinv(count, lower_tail)), float(gammaincinv(count + 1.0, upper_tail))
 
 
+def are_simultaneous(
+    axes: tuple[str, str], mark: str, blocks: xr.Dataset, count_evidence: CountEvidence
+) -> bool:
+    """Return whether two axes hold samples at the same instants.
+
+    The numbers of held samples are then equal in every block, but for those that chance adds. At
+    independent instants, their difference scatters as both together; at whatever rate over time, it
+    has at least the variance of that number of losses, each of the mean length. The limit is half
+    of the smaller.
+    """
+    rows = [[str(name) for name in blocks["axis"].values].index(axis) for axis in axes]
+    samples, counts = (blocks[name].values[rows].astype(np.float64) for name in ("samples", mark))
+    usual = count_evidence.of[mark][0][rows] if mark in count_evidence.of else np.zeros_like(counts)
+    is_common = (samples > 0.0).all(axis=0)
+    if not is_common.any():
+        return False
+    held, chance = (counts - usual)[:, is_common], usual - usual**2 / np.maximum(samples, 1.0)
+    by_chance = chance[:, is_common].sum(axis=1)
+    count = np.maximum(held.sum(axis=1), 1.0)
+    runs = [_held_runs(blocks, axis, mark, float(usual[n].sum())) for n, axis in enumerate(axes)]
+    separate = np.minimum(is_common.sum() * held.var(axis=1) - by_chance, count**2 / runs).sum()
+    difference = is_common.sum() * np.var(held[0] - held[1]) - by_chance.sum()
+    return bool(difference < 0.5 * separate)
+
+
 def _held_runs(blocks: xr.Dataset, axis: str, mark: str, usual: float) -> float:
     """Return how often samples were held: runs of repeats, less those of the quantization grid."""
     totals = {

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.special import ndtr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.conditioned_baseline import add_outlier_power, predict_baseline
@@ -17,7 +18,11 @@ from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.diagnose.settings import Settings
-from gyrostab.diagnose.statistics.sample_sizes import centre_of_range, estimate_from_counts
+from gyrostab.diagnose.statistics.sample_sizes import (
+    are_simultaneous,
+    centre_of_range,
+    estimate_from_counts,
+)
 from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import make_effect
 from tests.support.effect_bench import run
@@ -174,7 +179,8 @@ def test_number_and_length_of_held_samples_are_estimated(fill):
     blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
     baseline, records = nulls(blocks, 40)
     fitted_effects = fit_identifications(name_effects(blocks, baseline, records), baseline)
-    assert [fitted.axes for fitted in fitted_effects] == [("x",), ("y",), ("z",)]
+    assert [fitted.axes for fitted in fitted_effects] == [("x", "y", "z")]
+    assert [fitted.effect.fill for fitted in fitted_effects if fitted.effect] == [fill]
     hours = float(blocks["samples"].sel(axis="x").sum()) / 36_000.0
     for fitted in fitted_effects:
         assert fitted.parameters["per_hour"].value == pytest.approx(60 / hours, rel=0.06)
@@ -183,6 +189,45 @@ def test_number_and_length_of_held_samples_are_estimated(fill):
         )
         for name, true in (("per_hour", 60 / hours), ("length", 0.467)):
             assert fitted.parameters[name].low < true < fitted.parameters[name].high
+
+
+def test_held_samples_of_independent_axes_are_separate_effects():
+    """Axes x and y repeat their samples together; z repeats its own at other instants."""
+    rng = np.random.default_rng(9)
+    noise = SCATTER * rng.standard_normal((3, 15_000))
+    for rows in ([0, 1], [2]):
+        for first in rng.choice(np.arange(50, 14_900, 30), 40, replace=False):
+            noise[rows, first : first + 5] = noise[rows, first - 1][:, None]
+    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list("xyz")))
+    baseline, records = nulls(blocks, 40)
+    fitted_effects = fit_identifications(name_effects(blocks, baseline, records), baseline)
+    assert [fitted.axes for fitted in fitted_effects] == [("x", "y"), ("z",)]
+
+
+@pytest.mark.parametrize(
+    ("number", "span", "step"),
+    [(3, 36_000, 0.0), (60, 36_000, 0.0), (60, 3_000, 0.0), (240, 36_000, 0.5)],
+)
+@pytest.mark.parametrize("is_together", [True, False])
+def test_instants_of_held_samples_are_compared_between_axes(number, span, step, is_together):
+    """Few and many losses, all within a twelfth of the record, and on a quantization grid.
+
+    The grid has a step of half the scatter: one sample in seven repeats the one before by chance.
+    """
+    rng = np.random.default_rng(3)
+    rates = SCATTER * rng.standard_normal((2, 36_000))
+    places = np.arange(10, span - 10, 10)
+    for rows in ([0, 1],) if is_together else ([0], [1]):
+        for first in rng.choice(places, number, replace=False):
+            rates[rows, first : first + 4] = rates[rows, first - 1][:, None]
+    usual = np.full((2, 180), 1e-3)
+    if step:
+        rates = step * SCATTER * (np.floor(rates / step / SCATTER) + 0.5)  # never zero
+        edges = step * np.arange(-20, 21)
+        usual[:] = 199.0 * (np.diff(ndtr(edges)) ** 2).sum()
+    blocks = reduce_log(make_log(rates, rate=10.0, unit="deg/h", axis=["x", "y"]))
+    counts = CountEvidence({"repeats": (usual, np.ones(2))})
+    assert are_simultaneous(("x", "y"), "repeats", blocks, counts) == is_together
 
 
 @pytest.mark.parametrize("number", [2, pytest.param(20, marks=pytest.mark.slow)])
