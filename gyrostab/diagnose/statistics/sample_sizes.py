@@ -212,10 +212,11 @@ def are_simultaneous(
 ) -> bool:
     """Return whether two axes hold samples at the same instants.
 
-    The numbers of held samples are then equal in every block, but for those that chance adds. At
-    independent instants, their difference scatters as both together; at whatever rate over time, it
-    has at least the variance of that number of losses, each of the mean length. The limit is half
-    of the smaller.
+    At the same instants, the numbers of held samples agree in every block, except for those by
+    chance. At independent instants, their difference has the variance of both together. If losses
+    become frequent on both axes at the same time, this changes the variance over the blocks, but
+    not that of the difference: it is then that of as many losses at random instants. The limit is
+    half of the smaller one.
     """
     rows = [[str(name) for name in blocks["axis"].values].index(axis) for axis in axes]
     samples, counts = (blocks[name].values[rows].astype(np.float64) for name in ("samples", mark))
