@@ -121,6 +121,9 @@ def test_bias_is_named_on_its_axis_and_may_be_a_telegraph():
     assert (effect["name"], effect["axes"]) == ("gauss_markov", ["x"])
     assert effect["alternatives"] == ["telegraph"]
     assert content["verdict"] == "explained"
+    # no held-out data show its course: its evidence is that of the whole record
+    gain = content["held_out"]["log_likelihood_gain"]
+    assert gain == pytest.approx(effect["held_out_gain"]["nats"], abs=0.1)
     for name, truth in (("rms", 0.2), ("correlation_time", 15.0)):
         size = effect["parameters"][name]
         assert abs(np.log(size["value"] / truth)) < 1.5 * NORMAL_95 * size["stderr"] / size["value"]
