@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 from gyrostab import diagnose
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.correlated_bias import CorrelatedBias, find_correlated_bias
+from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import find_components
 from gyrostab.diagnose.predict.condition import condition_on, refit_weights
@@ -44,8 +45,8 @@ def _find_on_x(model: dict, seed: int, duration: str = "1h") -> CorrelatedBias:
 
 @pytest.mark.parametrize(
     "noise",
-    [{"N": 0.003}, {"N": 0.003, "B": 0.1, "K": 1.0, "Q": 0.3}],
-    ids=["white", "strong"],
+    [{"N": 0.003}, {"N": 0.003, "B": 0.1, "K": 1.0, "Q": 0.3}, {"N": 0.003, "K": 1000.0}],
+    ids=["white", "strong", "far above white noise"],
 )
 def test_noise_shows_no_bias(noise):
     """By Markov's inequality at most one record in 20 exceeds 3 nats."""
@@ -75,6 +76,14 @@ def test_bias_is_found_with_its_size_and_time(rms, time, count):
     assert (np.abs(square - 1.0) < 3.0 * np.sqrt(2.0 / count)).all()
     assert (square > 0.05).all()
     assert np.mean([bias.nats for bias in found]) > 3.0
+
+
+def test_a_bias_in_the_model_is_no_evidence_of_another():
+    model = _make_model({"N": 0.003}, 1.0, 20.0)
+    blocks = reduce_log(simulate(model, duration="40min", rate=10.0, seed=6))
+    found = find_correlated_bias(initial_state(blocks, baseline_from_model(blocks, model)), "x")
+    assert found is not None
+    assert found.nats < 3.0
 
 
 def test_bands_of_lines_are_no_evidence_of_a_bias():
