@@ -31,14 +31,14 @@ def _make_model(noise: dict[str, float], rms: float = 0.0, time: float = 1.0) ->
     return {"noise": {"x": noise, "y": NOISE}, "effect": [bias] if rms else []}
 
 
-def _start(log: xr.Dataset) -> State:
+def _start_state(log: xr.Dataset) -> State:
     blocks = reduce_log(log)
     return initial_state(blocks, calibrate_noise(blocks))
 
 
 def _find_on_x(model: dict, seed: int, duration: str = "1h") -> CorrelatedBias:
     log = simulate(model, duration=duration, rate=10.0, seed=seed).sel(axis=["x"])
-    found = find_correlated_bias(_start(log), "x")
+    found = find_correlated_bias(_start_state(log), "x")
     assert found is not None
     return found
 
@@ -91,7 +91,7 @@ def test_bands_of_lines_are_no_evidence_of_a_bias():
     log = simulate(_make_model({"N": 0.003}), duration="40min", rate=10.0, seed=3).sel(axis=["x"])
     phase = 2.0 * np.pi * np.arange(log.sizes["time"]) / 10.0
     log["rate"] = log["rate"] + sum(3.0 * np.sin(f * phase) for f in (0.11, 0.17, 0.23))
-    state = _start(log)
+    state = _start_state(log)
     bands = state.blocks.sizes["band"]
     where = np.flatnonzero(state.blocks["band_high"].values <= 0.3)
     columns = [np.broadcast_to(np.eye(bands)[band], state.weight.shape[1:]) for band in where]
@@ -108,7 +108,7 @@ def test_a_bias_with_another_spectrum_is_found_once():
     decay = np.exp(-0.1 / 12.0)
     bias = lfilter([1.0], [1.0, -2.0 * decay, decay**2], rng.standard_normal(log.sizes["time"]))
     log["rate"] = log["rate"] + xr.DataArray(0.3 * bias / bias.std(), dims="time")
-    state = _start(log)
+    state = _start_state(log)
     effects, _ = effect_candidates(state.blocks, state.baseline["coefficient"])
     (candidate,) = [
         candidate
