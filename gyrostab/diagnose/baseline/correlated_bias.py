@@ -306,6 +306,34 @@ def _find_free_bands(state: State, axis: str) -> NDArray[np.bool_]:
     return out
 
 
+def _find_ranges(
+    means: Array, density: float, variance: Array, block: float
+) -> tuple[Array, Array]:
+    """Return the ends of the ranges of all parameters, `low` and `high` of `_AxisRecord`.
+
+    Parameters
+    ----------
+    means, variance : ndarray, shape (block,)
+        Block means [degree hour-1], and their white variance.
+    density : float
+        Of the white noise in the powers [degree2 hour-2 Hz-1].
+    block : float
+        Length of a block [s].
+    """
+    span = means.size * block
+    K, B = fine_grid(density, span, block)
+    scatter = _MAX_SCATTER * float(np.nanstd(np.diff(means[np.isfinite(means)])))
+    sizes = np.sqrt(block * float(np.nanmedian(variance)) * _DENSITY_RATIOS / 2.0)
+    ranges = [
+        (K[0], max(K[-1], scatter * math.sqrt(HOUR / block))),
+        (B[0], max(B[-1], scatter)),
+        (sizes[0], sizes[1]),
+        (0.5 * block, span / 4.0),
+    ]
+    low, high = np.log(np.array(ranges)).T
+    return low, high
+
+
 def _axis_record(state: State, axis: str) -> _AxisRecord | None:
     """Collect the means and powers of an axis, averaged over blocks of similar power."""
     blocks, baseline, row = state.blocks, state.baseline, state.axes.index(axis)
@@ -342,18 +370,8 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
     fit = Fit(mean, columns[:, :4], weight)
     square, _, _ = fit_squares(fit)
     block, variance = float(blocks.attrs["block_s"]), axis_values(baseline, "mean_variance", axis)
-    span = len(values) * block
     square[1] = max(float(square[1]), floor_square(fit))
-    K, B = fine_grid(HOUR * square[1], span, block)
-    densities = block * float(np.nanmedian(variance)) * _DENSITY_RATIOS
-    scatter = _MAX_SCATTER * float(np.nanstd(np.diff(values[present, 0])))
-    ranges = [
-        (K[0], max(K[-1], scatter * math.sqrt(HOUR / block))),
-        (B[0], max(B[-1], scatter)),
-        np.sqrt(densities / 2.0),
-        np.array([0.5 * block, span / 4.0]),
-    ]
-    low, high = np.log(np.array(ranges)).T
+    low, high = _find_ranges(values[:, 0], HOUR * float(square[1]), variance, block)
     if high[-1] <= low[-1] + math.log(2.0):
         return None
     log_times = np.linspace(low[-1], high[-1], _TIMES)
