@@ -11,7 +11,7 @@ import numpy as np
 
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
-from gyrostab.physics.phase import comb_density, fold
+from gyrostab.physics.phase import fold, line_density
 from gyrostab.units import HOUR, INNER
 
 _NRAD_PER_S = math.degrees(1e-9) * HOUR  # deg/h
@@ -207,7 +207,7 @@ class FeedbackReset(Effect):
         tail = kick / (1.0 + (2.0 * np.pi * cycles * self.decay) ** 2)
         power = {"kick": kick, "tail": tail, "sawtooth": response / (np.pi * number) ** 2}
         spectrum = {
-            name: comb_density(windows, place, strength) for name, strength in power.items()
+            name: line_density(windows, place, strength) for name, strength in power.items()
         }
         return Prediction(
             mean={"kick": resets, "tail": resets},

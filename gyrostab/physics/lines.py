@@ -21,8 +21,8 @@ from gyrostab.physics.base import (
 )
 from gyrostab.physics.phase import (
     TURN,
-    comb_density,
     fold,
+    line_density,
     resonance_density,
     sine_means,
     steady_line,
@@ -198,7 +198,7 @@ class RotationLine(Effect):
         cycles = k * self.order * np.abs(rotation) / TURN
         place = fold(cycles, windows.rate)
         power = 0.5 * (k**-self.rolloff * np.sinc(cycles / windows.rate)) ** 2
-        comb = comb_density(windows, place, power)
+        comb = line_density(windows, place, power)
         order = {"amplitude": np.ones((len(windows.axes), 3), np.complex128)}
         return Prediction(
             mean={"amplitude": mean}, spectrum={"amplitude": comb}, line=place, order=order

@@ -106,9 +106,9 @@ def line_density(windows: Windows, frequency: Array | float, power: Array | floa
     windows : Windows
         Windows with their bands.
     frequency : ndarray, shape (window,)
-        Aliased frequency of the line [Hz].
+        Aliased frequency of the line [Hz]; several lines, shape (line, window), add up.
     power : ndarray or float
-        Mean square of the line.
+        Mean square of the line, or of each; NaN in all bands where it is unknown.
 
     Returns
     -------
@@ -122,16 +122,14 @@ def line_density(windows: Windows, frequency: Array | float, power: Array | floa
         edges = np.concatenate(
             [[centres[0] ** 2 / inner[0]], inner, [centres[-1] ** 2 / inner[-1]]]
         )
-    where = np.broadcast_to(np.asarray(frequency, np.float64), windows.begin.shape)[:, None]
-    hit = (where >= edges[:-1]) & (where < edges[1:])
-    strength = np.broadcast_to(np.asarray(power, np.float64), windows.begin.shape)[:, None]
-    return hit * strength / (2.0 * np.diff(edges))
-
-
-def comb_density(windows: Windows, frequencies: Array, powers: Array) -> Array:
-    """Sum the `line_density` of several lines, one in each row."""
-    lines = zip(frequencies, powers, strict=True)
-    return sum((line_density(windows, *line) for line in lines), np.zeros(()))
+    shape = (windows.begin.size, centres.size)
+    band = np.searchsorted(edges, frequency, side="right") - 1
+    band, strength, window = np.broadcast_arrays(band, power, np.arange(shape[0]))
+    hit = (band >= 0) & (band < shape[1])
+    density = np.zeros(shape)
+    np.add.at(density, (window[hit], band[hit]), strength[hit])
+    density[window[np.isnan(strength)]] = np.nan
+    return density / (2.0 * np.diff(edges))
 
 
 def steady_line(windows: Windows, frequency: float) -> tuple[Array, Array]:

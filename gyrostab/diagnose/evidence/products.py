@@ -13,7 +13,7 @@ from scipy.special import log_ndtr
 from gyrostab.diagnose.evidence.folds import FOLDS
 from gyrostab.diagnose.evidence.wandering import RandomProcesses, expected_processes
 from gyrostab.diagnose.reduce.schema import axis_values
-from gyrostab.kernels.regression.evidence import chosen_products, mixed_evidence
+from gyrostab.kernels.regression.evidence import mixed_evidence, row_products
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.units import HOUR
 
@@ -137,7 +137,8 @@ def mean_products(
         if pairs is None:
             gram[g] = x.T @ x
         else:
-            gram[g][pairs] = gram[g][pairs[::-1]] = chosen_products(whitened, *pairs)
+            products = row_products(np.ascontiguousarray(whitened.T), *pairs)
+            gram[g][pairs] = gram[g][pairs[::-1]] = products
     return Products(square, cross, gram, determinant)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gyrostab.kernels.compiled import KERNEL
+from gyrostab.kernels.compiled import KERNEL, REORDER
 
 Array = NDArray[np.float64]
 #: What is this much less likely than the best, as a logarithm, adds nothing that counts: it is
@@ -79,11 +79,14 @@ def mixed_evidence(base: Array, rotated: Array, eigenvalues: Array, widths: Arra
     return np.asarray(best + np.log(np.exp(terms, out=terms).sum(axis=2)))
 
 
-@njit(**KERNEL)
-def chosen_products(columns: Array, first: NDArray[np.int64], second: NDArray[np.int64]) -> Array:
-    """Sum products of pairs of columns, ``columns[:, first[q]] @ columns[:, second[q]]``."""
-    out = np.zeros(first.size)
-    for i in range(columns.shape[0]):
-        for q in range(first.size):
-            out[q] += columns[i, first[q]] * columns[i, second[q]]
+@njit(fastmath=REORDER, **KERNEL)
+def row_products(rows: Array, first: NDArray[np.int64], second: NDArray[np.int64]) -> Array:
+    """Sum products of pairs of rows, ``rows[first[q]] @ rows[second[q]]``."""
+    out = np.empty(first.size)
+    for q in range(first.size):
+        own, other = rows[first[q]], rows[second[q]]
+        total = 0.0
+        for i in range(own.size):
+            total += own[i] * other[i]
+        out[q] = total
     return out
