@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
-from cyclopts import CycloptsError, UnusedCliTokensError
+from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
 
 from gyrostab.cli.options import read_toml
 from gyrostab.errors import SYSTEM_ERRNOS, GyrostabError, OptionError
@@ -136,12 +136,24 @@ def _join_duration(error: UnusedCliTokensError) -> str:
     return ""
 
 
+def _describe_command_line(error: CycloptsError) -> str:
+    """Say what is wrong with a command line."""
+    command = " ".join(["gyrostab", *(error.command_chain or ())])
+    if isinstance(error, UnusedCliTokensError):
+        if joined := _join_duration(error):
+            return f"{joined}, without a blank: a duration is one word"
+        text = f"Too many arguments: {' '.join(error.unused_tokens or [])}."
+    elif isinstance(error, MissingArgumentError) and error.argument and not error.keyword:
+        text = f"{error.argument.name.removesuffix('...')} is missing."
+    else:
+        text = str(error)
+    return f"{text} See {command} --help."
+
+
 def describe_error(error: Exception) -> int:
     """Print an exception as one message and return the exit code."""
-    if isinstance(error, UnusedCliTokensError) and (joined := _join_duration(error)):
-        return print_error(f"{joined}, without a blank: a duration is one word", 2)
     if isinstance(error, CycloptsError):
-        return print_error(f"{error} See gyrostab --help, or the command's own --help.", 2)
+        return print_error(_describe_command_line(error), 2)
     if isinstance(error, GyrostabError):
         return print_error(str(error), 2)
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):

@@ -193,6 +193,9 @@ BAD_INPUT = {
         "write --window 2min, without a blank",
     ),
     "no worker": (_bad_log("--workers", "0"), "--workers"),
+    "no log": (lambda folder: ["-o", folder / "out.nc"], r"LOG is missing\. See gyrostab run"),
+    "no output": (lambda folder: [write_log(folder / "good.csv")], "--output is missing"),
+    "option without its value": (_bad_log("--window"), "--window requires an argument"),
 }
 
 
