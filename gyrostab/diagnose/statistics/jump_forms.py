@@ -37,6 +37,8 @@ def jump_competitors(
     """Yield other courses of the means than jumps, on all axes together.
 
     A gradual change is a straight transition over four or eight blocks about the same instant.
+    Jumps at every restart compete with straight changes about each, up to the middle between two of
+    them: as many free sizes follow any slow course, such as motion of the tool.
 
     An event that ends lasts for two blocks to a tenth of the record, before or after the instant.
     It is two jumps if the level after it differs from that before.
@@ -45,6 +47,7 @@ def jump_competitors(
     Therefore jumps must keep their evidence when the white noise of the means may be larger for
     some time about the instant, with and without the jumps.
     """
+    yield from _change_between_restarts(components, state, error)
     jumps = [component for component in components if is_free_jump(component, state)]
     if not jumps:
         return
@@ -77,6 +80,32 @@ def jump_competitors(
     yield Competitor("means that scatter for a while", scatter, settings.ambiguous_nats)
 
 
+def _change_between_restarts(
+    components: Sequence[Component], state: State, error: float
+) -> Iterator[Competitor]:
+    """Yield the gradual change that competes with jumps at every restart, if there are any."""
+    jumps = [
+        component
+        for component in components
+        if component.candidate.effect == _JUMP and len(component.variant.columns) > 1
+    ]
+    if not jumps:
+        return
+    block, restarts = float(state.blocks.attrs["block_s"]), state.blocks["restart_end"].values
+    block_count = state.blocks.sizes["block"]
+    edges = np.concatenate([[0.0], (restarts[1:] + restarts[:-1]) / 2.0, [block_count * block]])
+    time = (np.arange(block_count) + 0.5) * block
+    courses = np.clip((time - edges[:-1, None]) / np.diff(edges)[:, None], 0.0, 1.0)
+    gain = sum(
+        component_mixture(jump, state, _with_course(jump, *courses)).evidence
+        - component_mixture(jump, state).evidence
+        for jump in jumps
+    )
+    evidence = sum(max(component.evidence_nats, 0.0) for component in jumps)
+    allowed = state.settings.ambiguous_nats + state.settings.form_error_share * evidence
+    yield Competitor("a gradual change", gain, error + allowed)
+
+
 def _sum_evidence(jumps: Sequence[Component], state: State, courses: Sequence[Array]) -> float:
     """Return the log evidence of other courses (block,), one for each jump, of free size."""
     return sum(
@@ -87,7 +116,7 @@ def _sum_evidence(jumps: Sequence[Component], state: State, courses: Sequence[Ar
 
 def _with_course(jump: Component, *courses: Array) -> Variant:
     """Return the variant of a jump with courses (block,) instead of the step."""
-    shape = jump.variant.design.shape
+    shape = jump.variant.design[:1].shape
     design = np.concatenate([np.broadcast_to(course, shape) for course in courses])
     return replace(jump.variant, design=design)
 

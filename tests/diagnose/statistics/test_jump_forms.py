@@ -136,11 +136,26 @@ def test_jumps_at_every_restart_compete_as_one_design(seed: int) -> None:
     assert {component.row for component in components} == {("x",), ("y",)}
     assert all(len(component.variant.columns) == 3 for component in components)
     assert sum_evidence(components) > 15.0
+    assert not winning_forms(components, state)
     for component in components:
         mean, covariance = component_mixture(component, state).moments()
         error = np.sqrt(np.diag(covariance))
         assert (np.abs(mean - SIZES["xy".index(component.row[0])]) < 4.0 * error).all()
         assert (error < 0.5).all()
+
+
+def test_a_slow_course_is_not_a_jump_at_every_restart() -> None:
+    """Steps at 34 gaps follow a slow wave, which ends, and straight changes follow it better."""
+    gaps = tuple((begin, begin + 20.0) for begin in np.arange(300.0, 10_500.0, 300.0))
+    course = 300.0 * np.exp(-(((np.arange(21_600) / RATE - 5400.0) / 1200.0) ** 2))
+    model = {"noise": {"N": 0.05, "K": 0.4}, "log": {"axes": ["x", "y"]}}
+    blocks = reduce_log(drifting_log(1, course * [[1.0], [-0.7]], gaps))
+    jumps, state = try_jumps(blocks, baseline_from_model(blocks, model))
+    components = find_components([jumps], state)[jumps.key]
+    assert {len(component.variant.columns) for component in components} == {len(gaps)}
+    assert sum_evidence(components) > 50.0
+    assert winning_forms(components, state) == {"a gradual change"}
+    assert not keep_physical(components, state)[0]
 
 
 @pytest.mark.slow
