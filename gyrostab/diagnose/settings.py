@@ -119,10 +119,10 @@ class Settings:
         "autoregression fits the spectrum of the rival, normal noise",
     )
     surrogate_share: float = _make_setting(
-        0.01,
+        0.05,
         "1",
-        "Share of the time-shifted surrogates that may explain as much as the channel.",
-        "the default false-alarm probability; two of the 200 surrogates",
+        "Share of a channel and its time-shifted surrogates that may explain as much as it.",
+        "usual level of a test; the least that 20 surrogates can show is 1 / 21",
     )
     term_correlation: float = _make_setting(
         0.999,
@@ -178,7 +178,7 @@ class Settings:
         20,
         "surrogate",
         "Time-shifted surrogates without which a channel is not tested.",
-        "choice: a tenth of the 200 surrogates",
+        "the least round number that can show a share of 5 %",
     )
     max_earth_rate: float = _make_setting(
         20.0,

@@ -24,9 +24,8 @@ from gyrostab.diagnose.statistics.base import Competitor
 from gyrostab.diagnose.statistics.candidates import largest_size
 from gyrostab.physics.registry import effects
 
-#: Number of time-shifted surrogates: two of them make the allowed share of 1 %.
+#: Number of time shifts at most, the recorded time among them: ten make the allowed share of 5 %.
 TIME_SHIFTS = 200
-SHIFT_RANGE = (0.05, 0.95)  # of the record
 Array = NDArray[np.float64]
 _PPM = 1e6  # in one
 _MIN_EIGENVALUE = 1e-12  # of a correlation; above rounding errors
@@ -328,49 +327,63 @@ def passes_time_shift_test(
     passed : bool
         Also true where no surrogate can be made.
     p_value, nats : float
-        Share of the surrogates that explain as much, and by how much the best of them explains more
-        than the channel [nats]; NaN where too few of them differ from the channel.
+        Share of the channel and its surrogates that explain as much as the channel, and by how much
+        the best surrogate explains more [nats]; NaN where too few of them differ from the channel.
+
+    Notes
+    -----
+    All shifts round the record are equally likely for a channel that has nothing to do with the
+    rate. Those near the recorded time therefore count, although they resemble the channel: without
+    them, a smooth channel passes whenever it is near the best time. Copies from elsewhere do not
+    count, since a periodic channel repeats itself.
     """
     following_components = [component for component in components if _follows_channel(component)]
     if not following_components:
         return True, np.nan, np.nan
     block_count = state.blocks.sizes["block"]
-    shifts = np.unique(
-        np.linspace(block_count * SHIFT_RANGE[0], block_count * SHIFT_RANGE[1], TIME_SHIFTS).astype(
-            int
-        )
-    )
+    shifts = np.unique(np.linspace(0, block_count, TIME_SHIFTS, endpoint=False).astype(int))[1:]
     real, shifted = 0.0, np.zeros(shifts.size)
-    valid = np.ones(shifts.size, np.bool_)
-    limit = state.settings.majority_share
+    is_similar = np.zeros(shifts.size, np.bool_)
     for component in following_components:
         surrogates = make_surrogates(component, state.blocks, state.baseline["coefficient"], shifts)
-        row = state.axes.index(component.row[0])
-        for number, surrogate in enumerate(surrogates):
-            if surrogate is None or max_correlation(surrogate, component.variant, row) > limit:
-                valid[number] = False
-        chosen = [
-            surrogate if surrogate is not None else component.variant for surrogate in surrogates
-        ]
-        shifted_candidates = [
-            replace(component.candidate, effect=f"shifted {number}", variants=(variant,))
-            for number, variant in enumerate(chosen)
-        ]
-        # all variants: the channel pays for the search of the best one, as no surrogate has to
-        all_evidence = compute_evidence(
-            [component.candidate, *shifted_candidates],
-            state.blocks,
-            state,
-            folds,
-        )
-        values = np.array([evidence.evidence_nats[0, row] for evidence in all_evidence])
+        values = _compute_shifted_evidence(component, surrogates, state, folds)
         real += float(values[0])
         shifted += values[1:]
-    if valid.sum() < state.settings.min_surrogates:
+        row, limit = state.axes.index(component.row[0]), state.settings.majority_share
+        is_similar |= [
+            surrogate is None or max_correlation(surrogate, component.variant, row) > limit
+            for surrogate in surrogates
+        ]
+    different = np.flatnonzero(~is_similar)
+    if different.size < state.settings.min_surrogates:
         return True, np.nan, np.nan
-    p_value = float(np.mean(shifted[valid] >= real))
-    nats = float(shifted[valid].max() - real)
-    return p_value <= state.settings.surrogate_share, p_value, nats
+    first, stop = different[0], different[-1] + 1
+    counted = np.concatenate([shifted[:first], shifted[different], shifted[stop:]])
+    p_value = float((1 + np.sum(counted >= real)) / (1 + counted.size))
+    return p_value <= state.settings.surrogate_share, p_value, float(counted.max() - real)
+
+
+def _compute_shifted_evidence(
+    component: Component,
+    surrogates: Sequence[Variant | None],
+    state: State,
+    folds: xr.DataArray,
+) -> Array:
+    """Return the evidence of the channel, then of each surrogate, on the axis of a component.
+
+    The channel has all variants: it pays for the search of the best one, as no surrogate has to.
+    """
+    shifted = [
+        replace(
+            component.candidate,
+            effect=f"shifted {number}",
+            variants=(component.variant if surrogate is None else surrogate,),
+        )
+        for number, surrogate in enumerate(surrogates)
+    ]
+    all_evidence = compute_evidence([component.candidate, *shifted], state.blocks, state, folds)
+    row = state.axes.index(component.row[0])
+    return np.array([evidence.evidence_nats[0, row] for evidence in all_evidence])
 
 
 def _follows_channel(component: Component) -> bool:
