@@ -73,6 +73,10 @@ class NothingFound:
 
 @pytest.fixture
 def small(monkeypatch):
+    """Benchmarks of two small cases; the figures of `finished` are drawn, those of others empty."""
+    monkeypatch.setattr(
+        "gyrostab.plot.save_png", lambda figure, target, **_: Path(target).write_bytes(b"")
+    )
     monkeypatch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", small_plans)
     monkeypatch.setitem(core._DEFAULTS, "counterparts", 0)
 
@@ -112,6 +116,12 @@ def test_truths_are_committed_before_the_first_diagnosis(finished):
     assert len(sums.splitlines()) == 2
     written = [path.stat().st_mtime_ns for path in (folder / "diagnoses").glob("*.json")]
     assert (folder / "SHA256SUMS").stat().st_mtime_ns < min(written)
+
+
+def test_figures_are_drawn(finished):
+    folder, *_ = finished
+    for name in ("completeness", "reliability", "calibration", "ranks", "roc"):
+        assert (folder / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_recording_reveals_nothing_of_the_truth(finished):
