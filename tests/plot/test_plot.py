@@ -25,6 +25,7 @@ from gyrostab.plot.signal import thin
 from gyrostab.plot.style import save_png
 from gyrostab.report.product import write_report
 from tests.support import synthetic
+from tests.support.repetitions import first_of
 
 
 @pytest.fixture(scope="module")
@@ -333,7 +334,7 @@ def save_all(product: xr.Dataset, folder: Path) -> None:
         save_png(figure, folder / f"{number}.png", dpi=40)
 
 
-@pytest.mark.parametrize("windows", [1, 2])
+@pytest.mark.parametrize("windows", first_of(1, 2))
 def test_shortest_products_can_be_drawn(tmp_path, windows):
     short = synthetic.product(windows=40, axes="x").isel(time=slice(0, windows))
     save_all(short, tmp_path)
@@ -374,7 +375,7 @@ def test_negative_variance_has_no_deviation(product):
     assert np.isnan(after).sum() == np.isnan(before).sum() + 1
 
 
-@pytest.mark.parametrize("share", [1.0, 0.7])
+@pytest.mark.parametrize("share", first_of(0.7, 1.0))
 def test_product_of_a_constant_signal_is_drawn_without_warnings(share, tmp_path):
     values = np.random.default_rng(1).standard_normal(6000)
     values[: int(share * 6000)] = 7.5

@@ -19,6 +19,7 @@ from gyrostab.ingest.uniform import cut_log
 from gyrostab.kernels.grid.stamps import NO_STAMP
 from gyrostab.time.grid import time_coordinate
 from tests.support.raw_rows import START, expected, raw_log, stamps_of
+from tests.support.repetitions import first_of
 
 
 @pytest.mark.parametrize("rate", [300.0, 99.3])
@@ -68,7 +69,7 @@ def test_bursts_are_placed_by_count_and_a_loss_shows_as_a_lasting_delay():
     assert np.abs(present - samples).max() <= 10
 
 
-@pytest.mark.parametrize("share", [0.05, 0.2])
+@pytest.mark.parametrize("share", first_of(0.2, 0.05))
 @pytest.mark.parametrize("clock", ["bursts", "tenths", "jitter"])
 def test_rows_without_a_readable_stamp_count(clock, share):
     """They are present samples, so that neither the rate nor a loss depends on their number."""
@@ -147,7 +148,10 @@ def test_arrival_at_random_times_loses_no_row():
     assert np.isfinite(log.rate.values).sum() == 10_000
 
 
-@pytest.mark.parametrize(("rate", "n"), [(700.0, 2000), (700.0, 50_000), (300.0, 50_000)])
+@pytest.mark.parametrize(
+    ("rate", "n"),
+    [(700.0, 2000), (700.0, 50_000), pytest.param(300.0, 50_000, marks=pytest.mark.full)],
+)
 def test_stamps_coarser_than_the_jitter_of_a_sample(rate, n):
     """At 700 Hz in whole milliseconds the steps are 1 ms and 2 ms; neither is the period."""
     keep = np.random.default_rng(1).random(n) > 0.03
@@ -162,7 +166,7 @@ def test_stamps_coarser_than_the_jitter_of_a_sample(rate, n):
 @pytest.mark.parametrize(
     "pattern", [[1, 1, 1, 0, 0], [1, 0, 1, 1, 0], [1, 1, 0], [1, 1, 0, 0, 0, 0, 0]]
 )
-@pytest.mark.parametrize("rate", [100.0, 300.0, 248.7])
+@pytest.mark.parametrize("rate", first_of(248.7, 100.0, 300.0))
 @pytest.mark.parametrize("jitter", [0.0, 0.03])
 def test_rows_missing_in_a_fixed_pattern_leave_the_declared_grid(pattern, rate, jitter):
     samples = np.flatnonzero(np.resize(pattern, 6000))
@@ -254,11 +258,11 @@ def lose_samples(kind, share, rows, random):
 @pytest.mark.parametrize(
     ("kind", "share", "jitter", "unit"),
     [
-        ("single", 0.5, 0.2, 1),
+        pytest.param("single", 0.5, 0.2, 1, marks=pytest.mark.full),
         ("single", 0.6, 0.2, 1000),
         ("single", 0.8, 0.1, 1000),
         ("single", 0.3, 0.3, 100_000),
-        ("bursts", 0.8, 0.2, 1_000_000),
+        pytest.param("bursts", 0.8, 0.2, 1_000_000, marks=pytest.mark.full),
         ("bursts", 0.4, 0.3, 1_000_000),
     ],
 )
@@ -282,7 +286,7 @@ def test_rows_lost_among_shared_stamps_make_no_rows_of_the_tick():
     assert log.sizes["time"] == pytest.approx(2000, abs=3)
 
 
-@pytest.mark.parametrize("rows", [1000, 5000])
+@pytest.mark.parametrize("rows", first_of(1000, 5000))
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.3])
 @pytest.mark.parametrize("group", [4, 5])
 @pytest.mark.parametrize("period_ms", [1, 4, 10])
