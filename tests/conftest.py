@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # The same examples in every run of `make test`; other ones, and more, in `make test-full`.
 settings.register_profile(
-    "fast", deadline=None, max_examples=25, derandomize=True, database=None, print_blob=True
+    "fast", deadline=None, max_examples=15, derandomize=True, database=None, print_blob=True
 )
 settings.register_profile("full", deadline=None, max_examples=100, print_blob=True)
 settings.load_profile("fast")
