@@ -190,7 +190,7 @@ def test_noise_without_channels_has_no_mismatch_and_a_constant_axis_is_left_out(
 
 def test_axis_is_diagnosed_alone(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     noise = {"noise": {"N": 0.003}, "log": {"axes": ["x", "y"]}}
-    to_netcdf(simulate(noise, duration="10min", rate=10.0, seed=1), tmp_path / "log.nc")
+    to_netcdf(simulate(noise, duration="5min", rate=10.0, seed=1), tmp_path / "log.nc")
     options = ["--nulls", "100", "-o", tmp_path / "found"]
     assert call("diagnose", tmp_path / "log.nc", "--axis", "up", *options) == 2
     assert "axis 'up' is not in the log; it has x, y" in capfd.readouterr().err

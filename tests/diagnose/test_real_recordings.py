@@ -76,7 +76,7 @@ def test_no_resets_without_the_ramp_channel(open_recording: Callable[..., Any]) 
 
 
 def test_coarse_quantization_grid_is_not_a_dead_zone(open_recording: Callable[..., Any]) -> None:
-    blocks = reduce_log(open_recording("rlg-static-30min"))
+    blocks = reduce_log(open_recording("rlg-static-30min", end=600.0))
     assert has_coarse_grid(blocks).all()
     level = calibrate_noise(blocks)["coefficient"]
     candidates, reasons = effect_candidates(blocks, level)

@@ -50,8 +50,8 @@ def _find_on_x(model: dict, seed: int, duration: str = "1h") -> CorrelatedBias:
 )
 def test_noise_shows_no_bias(noise):
     """By Markov's inequality at most one record in 20 exceeds 3 nats."""
-    nats = [_find_on_x(_make_model(noise), seed, "40min").nats for seed in range(6)]
-    assert np.sum(np.array(nats) > 3.0) <= 1
+    nats = [_find_on_x(_make_model(noise), seed, "40min").nats for seed in range(3)]
+    assert max(nats) < 3.0
     assert np.median(nats) < 0.0
 
 
@@ -124,7 +124,7 @@ def test_a_bias_with_another_spectrum_is_found_once():
 
 
 def test_bias_is_named_on_its_axis_and_may_be_a_telegraph():
-    log = simulate(_make_model(NOISE, 0.2, 15.0), duration="1h", rate=10.0, seed=8)
+    log = simulate(_make_model(NOISE, 0.2, 15.0), duration="30min", rate=10.0, seed=8)
     content = json.loads(diagnose(log, nulls=100).to_json())
     (effect,) = content["effects"]
     assert (effect["name"], effect["axes"]) == ("gauss_markov", ["x"])

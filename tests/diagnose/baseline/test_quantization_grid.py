@@ -106,7 +106,7 @@ def test_angle_share_is_that_of_simulated_counters(mean: float, scatter: float) 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "names"),
-    [("rate", ["rate_quantization"]), ("angle", [])],
+    [("angle", []), pytest.param("rate", ["rate_quantization"], marks=pytest.mark.full)],
 )
 def test_only_a_rounded_rate_is_named(kind: str, names: list[str]) -> None:
     blocks = quantized_record(kind, 2.0, size=9_000)
@@ -160,7 +160,7 @@ def test_samples_stuck_at_zero_are_missing_in_neighbouring_bins(zone: float) -> 
     [
         (np.trunc, 0.0, ["rate_quantization"]),
         (np.rint, 1.0, ["dead_zone"]),
-        (np.rint, 0.0, []),
+        pytest.param(np.rint, 0.0, [], marks=pytest.mark.full),
     ],
 )
 def test_truncation_and_dead_zone_are_distinguished(how, zone: float, names: list[str]) -> None:

@@ -44,7 +44,7 @@ def jumped():
     return _make_log([JUMP], 2)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_jump_within_a_block_explains_its_power(jumped):
     diagnosis = _diagnose_log(jumped)
     assert diagnosis.verdict == "explained"

@@ -16,6 +16,7 @@ from gyrostab.kernels.spectra.expected import correlated_powers
 from gyrostab.kernels.spectra.periodogram import ordinates, taper
 from gyrostab.simulate import simulate
 from gyrostab.simulate.model import read_model
+from tests.support.repetitions import first_of
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
 WANDER_30_S = {"name": "gauss_markov", "rms": [1.0], "correlation_time": 30.0}
@@ -67,17 +68,21 @@ def test_powers_of_a_simulation_are_the_expected_ones(effect):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", first_of(7, 8))
 @pytest.mark.parametrize(
     "effect",
-    [WANDER_30_S, WANDER_300_S, SLOW_HOPS, FAST_HOPS],
-    ids=["wander, 30 s", "wander, 300 s", "hops, 200 s", "hops, 45 s"],
+    [
+        pytest.param(WANDER_30_S, id="wander, 30 s"),
+        pytest.param(WANDER_300_S, id="wander, 300 s", marks=pytest.mark.full),
+        pytest.param(SLOW_HOPS, id="hops, 200 s"),
+        pytest.param(FAST_HOPS, id="hops, 45 s", marks=pytest.mark.full),
+    ],
 )
-def test_no_mismatch_against_its_own_model(effect):
-    for seed in (7, 8):
-        model, log = _simulate_effect(effect, seed)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            diagnosis = diagnose(log, simulation=model, nulls=100)
-        assert (diagnosis.verdict, diagnosis.content["mismatches"]) == ("no mismatch", [])
-        found = {item["name"] for item in diagnosis.content["baseline"].get("expected", [])}
-        assert found == ({"telegraph"} if effect["name"] == "telegraph" else set())
+def test_no_mismatch_against_its_own_model(effect, seed):
+    model, log = _simulate_effect(effect, seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        diagnosis = diagnose(log, simulation=model, nulls=100)
+    assert (diagnosis.verdict, diagnosis.content["mismatches"]) == ("no mismatch", [])
+    found = {item["name"] for item in diagnosis.content["baseline"].get("expected", [])}
+    assert found == ({"telegraph"} if effect["name"] == "telegraph" else set())

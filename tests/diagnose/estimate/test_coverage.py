@@ -94,7 +94,7 @@ def test_intervals_of_a_slow_curved_supply_response():
     assert median_half_width(estimates, "lag") < 0.5 * time
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_intervals_of_a_warm_up_faster_than_the_grid():
     time, size = 25.0, 1.0
     estimates = fit_records(
@@ -105,7 +105,7 @@ def test_intervals_of_a_warm_up_faster_than_the_grid():
     assert median_half_width(estimates, "time") < 0.6 * time
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_intervals_of_a_dead_band_between_grid_values():
     width, size = 0.9, 0.15
     heat = np.interp(np.arange(SECONDS), *np.transpose(HEAT))

@@ -53,8 +53,8 @@ def diagnose_against_model(effects, *, environment=(), more=(), axes="xyz", seed
     ("effects", "environment", "axes"),
     [
         ([SPIKES, MEMORY, WALK], (SHAKE,), "xyz"),
-        ([HELD], (), "xy"),
-        ([SWAY], (), "xy"),
+        pytest.param([HELD], (), "xy", marks=pytest.mark.full),
+        pytest.param([SWAY], (), "xy", marks=pytest.mark.full),
         ([EARTH, SCALE], (TURN,), "xyz"),
     ],
     ids=["spikes, memory, walk", "held samples", "sway", "turning"],
@@ -138,7 +138,10 @@ def test_blocks_with_a_moving_known_rate_are_left_out(blocks):
     assert not moving[(end < 270.0) | ((begin > 360.0) & (end < 770.0)) | (begin > 860.0)].any()
 
 
-@pytest.mark.parametrize(("frequency", "quality"), [(0.3, 20.0), (1.3, 30.0), (0.21, 60.0)])
+@pytest.mark.parametrize(
+    ("frequency", "quality"),
+    [(0.3, 20.0), (1.3, 30.0), pytest.param(0.21, 60.0, marks=pytest.mark.full)],
+)
 def test_narrow_resonance_is_expected_with_the_leakage_of_the_taper(frequency, quality):
     """Compare with white noise through a resonator of scipy, driven far longer than its memory."""
     effect = {"name": "spectral_line", "amplitude": 1.0, "frequency": frequency, "quality": quality}

@@ -352,7 +352,11 @@ def test_anomalous_samples_do_not_raise_the_noise(size):
             {"cutoff": 2.0, "order": 2},
             {"cutoff": 2.0, "order": 2.0, "instrument": 1.0, "pick": 0.0, "length": 0.0},
         ),
-        ({"length": 0.5}, {"length": 0.5, "instrument": 1.0, "cutoff": 0.0}),
+        pytest.param(
+            {"length": 0.5},
+            {"length": 0.5, "instrument": 1.0, "cutoff": 0.0},
+            marks=pytest.mark.full,
+        ),
     ],
 )
 def test_noise_before_a_filter_is_recovered(table, grid, lost):

@@ -64,7 +64,7 @@ def test_walk_under_vibration_has_evidence_in_the_means(seed: int) -> None:
     assert evidence[1] < 3.0
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_walk_under_vibration_is_named_and_sized() -> None:
     found = diagnose(shaken_log(2, (WALK,)), nulls=100)
     assert found.verdict == "explained"

@@ -22,6 +22,7 @@ from gyrostab.diagnose.statistics.power_forms import burst_intervals
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import find_components
 from tests.support.named import name_effects, nulls
+from tests.support.repetitions import first_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -65,7 +66,7 @@ def components_of(state: State, tried: Candidate) -> list[Component]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("inside", [slice(0, 3), slice(-4, None)])
+@pytest.mark.parametrize("inside", first_of(slice(0, 3), slice(-4, None)))
 def test_temporary_noise_is_not_ageing(inside: slice) -> None:
     factor = np.ones(BLOCKS)
     factor[inside] = 3.0

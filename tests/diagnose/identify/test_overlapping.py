@@ -99,7 +99,7 @@ def test_two_opposite_jumps_have_evidence_only_together():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_pair_is_found_where_any_course_explains_more_than_each():
     heat = {
         "profile": "ramps", "channel": "temperature", "unit": "degC",

@@ -148,8 +148,8 @@ def test_tails_of_blocks_in_which_an_axis_turns_do_not_count():
     assert evidence[1] < 3.0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("error", [0.0, pytest.param(2e-4, marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("error", [0.0, 2e-4])
 def test_whole_rotation_is_the_only_effect(error: float):
     diagnosis = diagnose(_log_whole_rotation(2, error=error), nulls=100)
     (effect,) = diagnosis.effects
@@ -157,7 +157,7 @@ def test_whole_rotation_is_the_only_effect(error: float):
     assert effect["parameters"]["spin"]["value"] == pytest.approx(1.0 + error, abs=2e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_tiny_share_of_the_rotation_is_a_scale_factor_error():
     blocks = _reduce_share(1e-6)
     baseline, records = nulls(blocks, 40)
@@ -170,7 +170,14 @@ def test_tiny_share_of_the_rotation_is_a_scale_factor_error():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("speed", "stick_slip"), [(90, 0.0), (90, 0.3), (720, 0.6)])
+@pytest.mark.parametrize(
+    ("speed", "stick_slip"),
+    [
+        (90, 0.3),
+        pytest.param(90, 0.0, marks=pytest.mark.full),
+        pytest.param(720, 0.6, marks=pytest.mark.full),
+    ],
+)
 def test_earth_rate_is_the_only_effect_on_a_tool_that_starts_to_rotate(
     speed: float, stick_slip: float
 ):

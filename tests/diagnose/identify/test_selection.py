@@ -15,6 +15,7 @@ from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.evidence.sample_counts import expected_counts, sample_count_evidence
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
 from gyrostab.diagnose.identify import identifiability
+from gyrostab.diagnose.identify.examination import prepare_examination
 from gyrostab.diagnose.identify.identifiability import (
     _is_possible,
     keep_physical,
@@ -62,7 +63,7 @@ def test_null_records_may_come_in_parts(shaken):
     baseline, records = nulls(blocks, 40)
     (together,) = records
     parts = [together.isel(record=part) for part in (slice(0, 15), slice(15, None))]
-    best = name_effects(blocks, baseline, parts).null_best
+    best = prepare_examination(blocks, baseline, parts).null_best
     assert_allclose(best, shaken.null_best, rtol=1e-9)
 
 
@@ -156,24 +157,27 @@ def test_a_size_is_impossible_only_beyond_its_error(
     ("table", "environment", "others"),
     [
         (
-            {"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]},
-            "usual",
-            {"g_sensitivity"},
-        ),
-        (
             {"name": "shupe", "sensitivity": 0.4, "axes": ["x"]},
             "usual",
             {"temperature_bias", "thermal_hysteresis", "warm_up"},
         ),
-        (
+        pytest.param(
+            {"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]},
+            "usual",
+            {"g_sensitivity"},
+            marks=pytest.mark.full,
+        ),
+        pytest.param(
             {"name": "shared_source", "N": [0.0012, 0.0012, -0.0012], "axes": ["x", "y", "z"]},
             "usual",
             set(),
+            marks=pytest.mark.full,
         ),
-        (
+        pytest.param(
             {"name": "spikes", "per_hour": 100.0, "kind": "outlier", "size": 30.0, "axes": ["z"]},
             "usual",
             set(),
+            marks=pytest.mark.full,
         ),
     ],
     ids=lambda value: value["name"] if isinstance(value, dict) else None,

@@ -98,7 +98,12 @@ def test_powers_match_their_definition(seed: int, size: int, lost: float, offset
 
 
 @pytest.mark.parametrize(
-    "gaps", [pytest.param("none", marks=pytest.mark.slow), "random", "stretches"]
+    "gaps",
+    [
+        pytest.param("none", marks=pytest.mark.slow),
+        pytest.param("random", marks=pytest.mark.full),
+        "stretches",
+    ],
 )
 def test_powers_of_white_noise_are_gamma_distributed(gaps: str):
     rng = np.random.default_rng(4)

@@ -44,7 +44,7 @@ def test_bayes_factor_of_noise_has_mean_one(count):
 def test_noise_has_no_sine(case):
     rng = np.random.default_rng([1, len(case)])
     largest = []
-    for _ in range(30):
+    for _ in range(15):
         noise = rng.standard_normal((3, SIZE))
         if case == "lost":
             noise[:, rng.random(SIZE) < 0.4] = np.nan
@@ -57,7 +57,7 @@ def test_noise_has_no_sine(case):
             noise[:, 5000:8000] *= 30.0
         largest.append(search(noise)["sine_nats"].max(axis=1).max())
     # A Bayes factor of e^2 is reached in at most e^-2 of the records; 8 nats name an effect.
-    assert np.mean(np.array(largest) > 2.0) <= 0.05
+    assert np.mean(np.array(largest) > 2.0) <= 0.07
     assert max(largest) < 5.0
 
 
@@ -104,7 +104,7 @@ def test_finds_a_line_whose_phase_wanders():
 def test_amplitude_has_the_error_it_states():
     rng = np.random.default_rng(4)
     amplitude, errors = np.sqrt(4.0 * 60.0 / SIZE), []
-    for _ in range(100):
+    for _ in range(60):
         frequency = rng.uniform(1.0, 4.0)
         noise = rng.standard_normal((1, SIZE)) + wave(
             frequency, amplitude, phase=rng.uniform(0.0, 6.0)
@@ -144,7 +144,7 @@ def test_weak_sine_is_named_with_frequency_and_amplitude():
     amplitude = np.sqrt(4.0 * 60.0 / SIZE)
     noise = rng.standard_normal((1, SIZE)) + wave(1.7321, amplitude)
     blocks = reduce_log(make_log(noise, rate=RATE, unit="deg/h"))
-    identified = name_effects(blocks, *nulls(blocks, 40)).identified
+    identified = name_effects(blocks, *nulls(blocks, 20)).identified
     assert [identification.effect for identification in identified] == ["spectral_line"]
     place = identified[0].components[0].place
     (size, stderr), (frequency, error) = estimate_line(blocks, "x", place)

@@ -43,7 +43,12 @@ def try_jumps(blocks: xr.Dataset, baseline: xr.Dataset) -> tuple[Candidate, Stat
 
 @pytest.mark.parametrize(
     ("way", "size", "jump"),
-    [(0.0, 0.4, True), (0.0, 4.0, True), (100.0, 0.8, False), (160.0, 4.0, False)],
+    [
+        (0.0, 0.4, True),
+        (100.0, 0.8, False),
+        pytest.param(0.0, 4.0, True, marks=pytest.mark.full),
+        pytest.param(160.0, 4.0, False, marks=pytest.mark.full),
+    ],
 )
 def test_gradual_change_is_not_a_jump(way: float, size: float, jump: bool) -> None:
     second = np.arange(18_000) / 10.0
