@@ -10,11 +10,24 @@ from scipy.integrate import quad
 
 from gyrostab.errors import OptionError
 from gyrostab.kernels.random.coloured import oscillator_psd
-from gyrostab.physics.phase import fold
+from gyrostab.physics.phase import fold, line_density
+from gyrostab.physics.prediction import Windows
 from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate
 from gyrostab.simulate.turning import rotation
 from tests.support.effect_bench import allan_of_density, build_effect, run, sigma, sinusoid_avar
+
+
+def test_the_power_of_lines_is_in_their_bands():
+    """Bands about 1, 2 and 4 Hz meet at 1.41 and 2.83 Hz; a line below 0.71 Hz is in none."""
+    begin = np.arange(3.0)
+    windows = Windows(begin, begin + 1.0, np.array([1.0, 2.0, 4.0]), 12.0, ("x",))
+    frequency = np.array([[1.5, 1.5, 1.5], [2.7, 3.0, 2.7], [0.5, 1.3, np.nan]])
+    power = np.array([[0.2, 0.2, 0.2], [0.3, 0.3, 0.3], [0.4, 0.4, np.nan]])
+    width = np.array([1.0, 2.0, 4.0]) * (math.sqrt(2.0) - math.sqrt(0.5))
+    expected = [[0.0, 0.5, 0.0], [0.4, 0.2, 0.3], [np.nan] * 3]
+    np.testing.assert_allclose(line_density(windows, frequency, power) * 2.0 * width, expected)
+    np.testing.assert_allclose(line_density(windows, 3.0, 0.3) * 2.0 * width, [[0.0, 0.0, 0.3]] * 3)
 
 
 def test_a_steady_line_has_the_allan_variance_of_a_sinusoid():

@@ -37,8 +37,6 @@ def jump_competitors(
     """Yield other courses of the means than jumps, on all axes together.
 
     A gradual change is a straight transition over four or eight blocks about the same instant.
-    Jumps at every restart compete with straight changes about each, up to the middle between two of
-    them: as many free sizes follow any slow course, such as motion of the tool.
 
     An event that ends lasts for two blocks to a tenth of the record, before or after the instant.
     It is two jumps if the level after it differs from that before.
@@ -47,7 +45,6 @@ def jump_competitors(
     Therefore jumps must keep their evidence when the white noise of the means may be larger for
     some time about the instant, with and without the jumps.
     """
-    yield from _change_between_restarts(components, state, error)
     jumps = [component for component in components if is_free_jump(component, state)]
     if not jumps:
         return
@@ -80,30 +77,24 @@ def jump_competitors(
     yield Competitor("means that scatter for a while", scatter, settings.ambiguous_nats)
 
 
-def _change_between_restarts(
-    components: Sequence[Component], state: State, error: float
-) -> Iterator[Competitor]:
-    """Yield the gradual change that competes with jumps at every restart, if there are any."""
-    jumps = [
-        component
-        for component in components
-        if component.candidate.effect == _JUMP and len(component.variant.columns) > 1
-    ]
-    if not jumps:
+def restart_competitors(component: Component, state: State) -> Iterator[Competitor]:
+    """Yield the gradual change that competes with jumps at every restart on an axis.
+
+    Its parts are straight changes about each restart, up to the middle between two of them. As many
+    free sizes follow any slow course, such as motion of the tool.
+    """
+    if component.candidate.effect != _JUMP or len(component.variant.columns) < 2:
         return
     block, restarts = float(state.blocks.attrs["block_s"]), state.blocks["restart_end"].values
     block_count = state.blocks.sizes["block"]
     edges = np.concatenate([[0.0], (restarts[1:] + restarts[:-1]) / 2.0, [block_count * block]])
     time = (np.arange(block_count) + 0.5) * block
     courses = np.clip((time - edges[:-1, None]) / np.diff(edges)[:, None], 0.0, 1.0)
-    gain = sum(
-        component_mixture(jump, state, _with_course(jump, *courses)).evidence
-        - component_mixture(jump, state).evidence
-        for jump in jumps
-    )
-    evidence = sum(max(component.evidence_nats, 0.0) for component in jumps)
-    allowed = state.settings.ambiguous_nats + state.settings.form_error_share * evidence
-    yield Competitor("a gradual change", gain, error + allowed)
+    gradual = component_mixture(component, state, _with_course(component, *courses)).evidence
+    steps = component_mixture(component, state).evidence
+    settings = state.settings
+    allowed = settings.ambiguous_nats + settings.form_error_share * component.evidence_nats
+    yield Competitor("a gradual change", gradual - steps, allowed)
 
 
 def _sum_evidence(jumps: Sequence[Component], state: State, courses: Sequence[Array]) -> float:

@@ -150,17 +150,21 @@ def test_jumps_at_every_restart_compete_as_one_design(seed: int) -> None:
 
 
 def test_a_slow_course_is_not_a_jump_at_every_restart() -> None:
-    """Steps at 34 gaps follow a slow wave, which ends, and straight changes follow it better."""
+    """Of two axes with 34 gaps, x has a slow wave, which ends, and y a level after each gap."""
     gaps = tuple((begin, begin + 20.0) for begin in np.arange(300.0, 10_500.0, 300.0))
-    course = 300.0 * np.exp(-(((np.arange(21_600) / RATE - 5400.0) / 1200.0) ** 2))
+    wave = 300.0 * np.exp(-(((np.arange(21_600) / RATE - 5400.0) / 1200.0) ** 2))
+    sizes = tuple(20.0 * np.random.default_rng(2).standard_normal(len(gaps)))
+    steps = levels(sizes, tuple(end for _, end in gaps), 10_800.0)
     model = {"noise": {"N": 0.05, "K": 0.4}, "log": {"axes": ["x", "y"]}}
-    blocks = reduce_log(drifting_log(1, course * [[1.0], [-0.7]], gaps))
+    blocks = reduce_log(drifting_log(1, np.stack([wave, steps]), gaps))
     jumps, state = try_jumps(blocks, baseline_from_model(blocks, model))
     components = find_components([jumps], state)[jumps.key]
     assert {len(component.variant.columns) for component in components} == {len(gaps)}
-    assert sum_evidence(components) > 50.0
-    assert winning_forms(components, state) == {"a gradual change"}
-    assert not keep_physical(components, state)[0]
+    assert {component.row for component in components} == {("x",), ("y",)}
+    assert min(component.evidence_nats for component in components) > 50.0
+    forms = {component.row: winning_forms([component], state) for component in components}
+    assert forms == {("x",): {"a gradual change"}, ("y",): set()}
+    assert [component.row for component in keep_physical(components, state)[0]] == [("y",)]
 
 
 @pytest.mark.slow
