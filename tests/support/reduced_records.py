@@ -61,6 +61,7 @@ def baseline(
             ),
             "known_mean": (("axis", "block"), np.zeros(shape)),
             "mean_variance": (("axis", "block"), np.full(shape, level * f["rate"] / f["samples"])),
+            "angle_variance": (("axis",), np.zeros(shape[0])),
             "coefficient": (("axis", "term"), coefficient),
             "grid_K": (("axis", "grid"), np.full((len(axes), 1), walk)),
             "grid_B": (("axis", "grid"), np.full((len(axes), 1), flicker)),

@@ -344,6 +344,7 @@ def assemble_baseline(
         "spectrum": expected,
         "known_mean": np.zeros(quiet.shape) if known_mean is None else known_mean,
         "mean_variance": variance,
+        "angle_variance": np.array([posterior.angle for posterior in posteriors]),
         "common": common,
         "shape_alone": shape_alone,
         "columns": columns,

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import Bounds, minimize
 
+from gyrostab.diagnose.baseline.axis_means import AxisMeans
 from gyrostab.diagnose.baseline.expected_statistics import (
     common_variance,
     separate_share,
@@ -30,11 +31,9 @@ from gyrostab.diagnose.baseline.posterior import (
     fine_grid,
     fit_squares,
     floor_square,
-    likelihood_of_means,
 )
 from gyrostab.diagnose.evidence.held_out import mean_residual
 from gyrostab.diagnose.evidence.wandering import (
-    RandomProcesses,
     add_correlated,
     expected_processes,
 )
@@ -98,8 +97,7 @@ class _AxisRecord:
     effects: Array  # (cell,): power of the effects in the model
     band: NDArray[np.int64]  # (cell,)
     unspread: Array  # (cell,): share of a density that gaps leave in its band
-    wander: RandomProcesses  # already in the model
-    means: dict[str, Any]  # other arguments of `likelihood_of_means`
+    means: AxisMeans
     #: (parameter,): ends of the ranges of the logarithms of K [deg/h^1.5], B [deg/h], and of a
     #: bias: of its rms times the root of its time [deg/h s^0.5], and of its time [s].
     low: Array
@@ -115,17 +113,16 @@ class _AxisRecord:
         width = points.shape[1]
         K, B, *bias = np.exp(np.clip(points, self.low[:width], self.high[:width])).T
         added = self.effects + np.square([B, K]).T @ self.fit.columns[:, 2:].T
-        wanders = [self.wander] * len(points)
+        means = [self.means] * len(points)
         if bias:
             variance, time = bias[0] ** 2 / bias[1], bias[1]
-            wanders = [
-                add_correlated(self.wander, *process)
+            means = [
+                self.means._replace(wander=add_correlated(self.means.wander, *process))
                 for process in zip(variance.tolist(), time.tolist(), strict=True)
             ]
             added = added + variance[:, None] * self._unit_powers(time)
         of_means = [
-            likelihood_of_means(**self.means, K=K[[i]], B=B[[i]], wander=wander)[0]
-            for i, wander in enumerate(wanders)
+            axis_means.log_likelihood(K[[i]], B[[i]])[0] for i, axis_means in enumerate(means)
         ]
         expected = self._fit_fast_noise(added)
         of_powers = (np.log(expected) + self.fit.power / expected) @ self.fit.weight
@@ -386,14 +383,14 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
         columns[:, 6],
         np.rint(columns[:, 4]).astype(np.int64),
         columns[:, 5],
-        expected_processes(baseline, axis),
-        {
-            "values": np.where(present[:, None], values, 0.0),
-            "effects": state.given_to("mean", axis),
-            "variance": variance,
-            "step": block,
-            "present": present,
-        },
+        AxisMeans(
+            np.where(present[:, None], values, 0.0),
+            state.given_to("mean", axis),
+            variance,
+            block,
+            present,
+            expected_processes(baseline, axis),
+        ),
         low,
         high,
         CubicSpline(log_times, np.log(powers)),

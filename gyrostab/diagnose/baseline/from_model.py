@@ -195,6 +195,7 @@ def scale_to_quiescent(
                 B=posterior.B * math.sqrt(factor),
                 draws=posterior.draws * factor * scatter,
                 slow=posterior.slow * factor * scatter,
+                angle=posterior.angle * factor,
             )
         )
     return scaled, np.array([factor for factor, _ in factors])

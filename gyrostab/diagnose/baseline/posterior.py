@@ -10,8 +10,8 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from gyrostab.diagnose.evidence.products import marginalise, mean_products, scale_columns
-from gyrostab.diagnose.evidence.wandering import RandomProcesses
+from gyrostab.diagnose.baseline.axis_means import AxisMeans
+from gyrostab.diagnose.evidence.wandering import RandomProcesses, no_processes
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -25,7 +25,6 @@ DRAWS = 512
 _MIN_POWER_RATIO = 0.05  # of expected powers that fitted effects may leave; design choice
 _MIN_STEP = 1e-3  # shortest step towards the best fit
 _ROUNDING_SHARE = 1e-12  # rounding error of a log likelihood
-_PRIOR_PRECISION = 1e-9  # of effects in the means, over that of one mean; nearly free
 
 
 class Fit(NamedTuple):
@@ -68,6 +67,7 @@ class Posterior(NamedTuple):
     joined: bool  # whether band powers and means agree about B and K
     #: (4,): squares that fit the bands best which the noise terms explain; None if these are all.
     of_means: Array | None = None
+    angle: float = 0.0  # variance of the angle where blocks meet [arcsec2]
 
 
 def average_blocks(power: Array, shape: Array, columns: Array) -> Fit:
@@ -227,32 +227,6 @@ def fine_grid(density: float, span: float, step: float) -> tuple[Array, Array]:
     )
 
 
-def likelihood_of_means(
-    values: Array,
-    effects: Array | None,
-    *,
-    variance: Array,
-    step: float,
-    K: Array,
-    B: Array,
-    present: NDArray[np.bool_],
-    wander: RandomProcesses | None = None,
-) -> Array:
-    """Compute the log likelihood of block means for every K and B, (point,).
-
-    Arguments are those of `gyrostab.diagnose.evidence.products.mean_products`; the designs of
-    effects (block, column) have any size.
-    """
-    columns = scale_columns(effects, len(values))
-    products = mean_products(
-        values, columns, variance=variance, step=step, K=K, B=B, present=present, wander=wander
-    )
-    least_variance = np.maximum(variance[present].min(initial=1.0), 1e-300)
-    precision = _PRIOR_PRECISION * np.eye(columns.shape[1]) / least_variance
-    products = marginalise(products, columns.shape[1], precision)
-    return np.asarray(-0.5 * (products.square[:, 0] + products.log_determinant))
-
-
 def _likelihood_of_powers(
     fit: Fit, spectrum: Array, K: Array, B: Array
 ) -> tuple[Array, Array, Array]:
@@ -333,10 +307,16 @@ def noise_posterior(
     density = HOUR * max(float(square[1]), floor_square(fit))
     coarse_K, coarse_B = fine_grid(density, mean.size * step, step)
     K, B = (axis_values.ravel() for axis_values in np.meshgrid(coarse_K, coarse_B, indexing="ij"))
-    values = np.where(present, mean, 0.0)[:, None]
-    slow = likelihood_of_means(
-        values, effects, variance=variance, step=step, K=K, B=B, present=present, wander=wander
+    means = AxisMeans(
+        np.where(present, mean, 0.0)[:, None],
+        effects,
+        variance,
+        step,
+        present,
+        no_processes(mean.size) if wander is None else wander,
     )
+    means = means.with_angle_noise(coarse_K, coarse_B, settings)
+    slow = means.log_likelihood(K, B)
     fast, best, normal = _likelihood_of_powers(fit, spectrum, K, B)
     joined = bool(slow.max() + fast.max() - (slow + fast).max() < settings.disagreement_nats)
     log = slow + fast if joined else slow
@@ -355,4 +335,14 @@ def noise_posterior(
     else:
         squares = np.maximum(square + error * rng.standard_normal((DRAWS, 4)), 0.0)
     squares[:, 1] = np.maximum(squares[:, 1], 0.01 * square[1])
-    return Posterior(square, error, K, B, weight, squares, slow_draws, joined)
+    return Posterior(
+        square,
+        error,
+        K,
+        B,
+        weight,
+        squares,
+        slow_draws,
+        joined,
+        angle=float(means.wander.angle),
+    )

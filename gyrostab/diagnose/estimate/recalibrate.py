@@ -139,8 +139,8 @@ def recalibrate(
 #: Variables of a baseline that an axis keeps with its noise. The grid follows from the posterior,
 #: and has as many points on all axes.
 _AXIS_VARIABLES = (
-    "coefficient", "stderr", "spectrum", "mean_variance", "square", "square_stderr", "posterior",
-    "posterior_slow",
+    "angle_variance", "coefficient", "stderr", "spectrum", "mean_variance", "square",
+    "square_stderr", "posterior", "posterior_slow",
 )  # fmt: skip
 
 
@@ -204,7 +204,9 @@ def _kept_posterior(baseline: xr.Dataset, row: int) -> Posterior:
         for name in ("square", "square_stderr", "grid_K", "grid_B", "posterior", "posterior_slow")
     )
     weight = np.exp(axis_baseline["grid_calibrated"].values)
-    return Posterior(square, error, K, B, weight / weight.sum(), draws, slow, True)
+    angle = float(axis_baseline["angle_variance"])
+    weight /= weight.sum()
+    return Posterior(square, error, K, B, weight, draws, slow, True, angle=angle)
 
 
 def _collect_effects(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from gyrostab.diagnose.evidence.folds import FOLDS
-from gyrostab.diagnose.evidence.wandering import RandomProcesses, expected_processes
+from gyrostab.diagnose.evidence.wandering import RandomProcesses, expected_processes, no_processes
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.kernels.regression.evidence import mixed_evidence, row_products
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
@@ -121,7 +121,7 @@ def mean_products(
     share, time, white = flicker_states(step, n * step)
     steps = np.full(n, step)
     if wander is None:
-        wander = RandomProcesses(np.empty(0), np.empty(0), np.zeros(n))
+        wander = no_processes(n)
     squares, times = np.append(share, wander.square), np.append(time, wander.time)
     shape = (K.size, values.shape[1])
     square, cross = np.empty(shape), np.empty((K.size, width, shape[1]))
@@ -130,7 +130,14 @@ def mean_products(
         squares[: share.size] = share * b
         used = slice(0 if b > 0.0 else share.size, None)
         whitened, determinant[g] = whiten(
-            stacked, spread + b * white, steps, present, k + wander.walk, squares[used], times[used]
+            stacked,
+            spread + b * white,
+            steps,
+            present,
+            k + wander.walk,
+            squares[used],
+            times[used],
+            float(wander.angle),
         )
         x, y = whitened[:, :width], whitened[:, width:]
         cross[g], square[g] = x.T @ y, np.einsum("ij,ij->j", y, y)

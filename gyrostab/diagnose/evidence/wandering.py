@@ -1,4 +1,11 @@
-"""Random processes in the means other than the noise: exponentially correlated ones and walks."""
+"""Random processes in the means other than white, flicker and random walk noise.
+
+Exponentially correlated ones and walks are effects. The angle also has motion that is faster than a
+block: microseisms, waves, the dither of a laser gyro. Its spectrum lies within the blocks, but it
+rarely comes back to the same angle at the end of a block. Every mean has the difference of the
+angles at both ends of its block, over its length; the angle between two blocks is in both means
+with opposite signs. Such noise moves means apart as quantization does, and nothing slow.
+"""
 
 from __future__ import annotations
 
@@ -20,19 +27,27 @@ class RandomProcesses(NamedTuple):
     square: Array  # (process,): variances of exponentially correlated processes [degree2 hour-2]
     time: Array  # (process,): their correlation times [s]
     walk: Array  # (block,): growth of the variance of random walks [degree2 hour-2 s-1]
+    angle: Array  # (): variance of the angle where blocks meet [arcsec2]
 
 
 def expected_processes(baseline: xr.Dataset, axis: str | int) -> RandomProcesses:
     """Return the random processes expected in the mean of an axis, by name or index."""
+    angle = axis_values(baseline, "angle_variance", axis)
     if "wander_square" not in baseline:
-        return RandomProcesses(np.empty(0), np.empty(0), np.zeros(baseline.sizes["block"]))
+        return no_processes(baseline.sizes["block"])._replace(angle=angle)
     square = axis_values(baseline, "wander_square", axis)
     active = square > 0.0
     return RandomProcesses(
         square[active],
         baseline.variables["wander_time"].values[active],
         axis_values(baseline, "wander_walk", axis),
+        angle,
     )
+
+
+def no_processes(block_count: int) -> RandomProcesses:
+    """Return no random processes, for so many blocks."""
+    return RandomProcesses(np.empty(0), np.empty(0), np.zeros(block_count), np.zeros(()))
 
 
 def add_correlated(processes: RandomProcesses, square: float, time: float) -> RandomProcesses:

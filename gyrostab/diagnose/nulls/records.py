@@ -267,7 +267,7 @@ def _draw_gamma(
 
 
 def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.Generator) -> Array:
-    """Draw block means: white noise, random walk, flicker and known random processes."""
+    """Draw block means: white noise, random walk, flicker and the expected random processes."""
     blocks, baseline = setup.blocks, setup.baseline
     n, step = blocks.sizes["block"], float(blocks.attrs["block_s"])
     unit_variance = np.stack(
@@ -305,6 +305,9 @@ def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.G
                 rng.standard_normal((n, 2)), memory / step, float(rng.standard_normal())
             )
             total[place] += np.sqrt(square) * wander
+        if processes.angle > 0.0:
+            angle = np.sqrt(processes.angle) * rng.standard_normal(n + 1)
+            total[place] += np.diff(angle) / step
     return np.asarray(total)
 
 

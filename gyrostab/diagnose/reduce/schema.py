@@ -184,6 +184,7 @@ BASELINE: dict[str, Variable] = {
     "spectrum": Variable(_BAND, _POWER, "expected power"),
     "known_mean": Variable(_BLOCK, _RATE, "mean rate of known effects"),
     "mean_variance": Variable(_BLOCK, "degree2 hour-2", "white variance of the block mean"),
+    "angle_variance": Variable(("axis",), "arcsec2", "variance of the angle where blocks meet"),
     "common": Variable(_BLOCK, "1", "relative variance that the powers of a block have in common"),
     "shape_alone": Variable(_BAND, "1", "shape of the gamma distribution without the common part"),
     "columns": Variable((*_BAND, "noise"), _POWER, "expected power per squared coefficient"),

@@ -179,10 +179,18 @@ def _pad_end(values: Array, size: int) -> Array:
 
 
 def _slow_allan_variance(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -> Array:
-    """Return the Allan variance of B, K and correlated processes by axis [degree2 hour-2]."""
+    """Return the Allan variance of all but white noise, by axis, without walks of effects.
+
+    In degree2 hour-2. Angle noise has the law of quantization.
+    """
     coefficient = baseline["coefficient"].values
     processes = (expected_processes(baseline, row) for row in range(blocks.sizes["axis"]))
-    total = np.array([part.square @ allan_variance(tau, part.time) for part in processes])
+    total = np.array(
+        [
+            part.square @ allan_variance(tau, part.time) + 3.0 * part.angle / tau**2
+            for part in processes
+        ]
+    )
     for place, term in enumerate(baseline["term"].values):
         if str(term) in ("B", "K"):
             total = total + LAWS[str(term)].avar(tau) * np.nan_to_num(coefficient[..., place]) ** 2

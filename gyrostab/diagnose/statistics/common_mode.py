@@ -126,7 +126,13 @@ def _whiten_means(
         processes = expected_processes(baseline, axis)
         states = np.append(b**2 * share, processes.square), np.append(times, processes.time)
         whitened, _ = whiten(
-            columns, variance, end - begin, present, k**2 / HOUR + processes.walk, *states
+            columns,
+            variance,
+            end - begin,
+            present,
+            k**2 / HOUR + processes.walk,
+            *states,
+            float(processes.angle),
         )
         increments[..., axis, :] = whitened.T.reshape(increments[..., axis, :].shape)
     return increments

@@ -309,10 +309,15 @@ def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, series: Arra
     decay = np.exp(-step[:, None] / np.append(np.inf, times))  # the random walk does not relax
     variance = baseline["mean_variance"].values[axis] + b**2 * white
     n = variance.size
+    shared = np.zeros(1 + slow.size)
+    if processes.angle > 0.0:  # the angle at the start of a block; that at its end is white noise
+        at_end = processes.angle / block**2
+        slow, shared = np.append(slow, at_end), np.append(shared, -at_end)
+        decay, variance = np.column_stack([decay, np.zeros(n)]), variance + at_end
     present = np.isfinite(series).reshape(-1, n).any(axis=0)
     present = present & np.isfinite(variance) & (variance > 0)
     walk = (k**2 / HOUR + processes.walk) * step
-    innovation, gain = filter_gains(variance, present, walk, slow, decay)
+    innovation, gain = filter_gains(variance, present, walk, slow, decay, shared)
     remaining = remaining_information(innovation, gain, decay)
     return MeanNoise(present.astype(float), innovation, gain, decay, remaining)
 

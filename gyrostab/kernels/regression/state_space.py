@@ -1,8 +1,10 @@
 """Block means of a random bias in one pass: whitening by a Kalman filter with a free constant.
 
 The bias is a random walk from an unknown start (the free constant), plus Ornstein-Uhlenbeck
-processes, plus white noise. The observations are means over consecutive blocks, so the moments are
-those of means, not of points.
+processes, plus white noise, plus the rate of white noise in the angle. The observations are means
+over consecutive blocks, so the moments are those of means, not of points. Angle noise adds the
+difference of the angles at both ends of a block, over its length: two blocks that meet have one
+angle in common, and means that add it with opposite signs.
 """
 
 from __future__ import annotations
@@ -129,6 +131,7 @@ def whiten(
     K2: Array,
     ou_variance: Array,
     ou_time: Array,
+    angle: float = 0.0,
 ) -> tuple[Array, float]:
     """Whiten columns of block means by the covariance V of their noise, with the constant removed.
 
@@ -149,6 +152,8 @@ def whiten(
         Growth of the variance of the random walk in a second, in every block.
     ou_variance, ou_time : ndarray, shape (p,)
         Variances and correlation times [s] of the Ornstein-Uhlenbeck processes.
+    angle : float
+        Variance of the angle noise where blocks meet [square of the unit of the columns times s].
 
     Returns
     -------
@@ -158,14 +163,17 @@ def whiten(
         ``log det V + log(1' V^-1 1)`` over the blocks present; 0 without any.
     """
     n, width = columns.shape
-    m = ou_variance.size + 1
+    slow = ou_variance.size + 1
+    m = slow + 1 if angle > 0.0 else slow  # the last state is the angle at the start of a block
     out = np.zeros((n, width))
     state = np.zeros((m, width))
     room = np.zeros((5, m))
     decay, weight, drive, shared, gain = room[0], room[1], room[2], room[3], room[4]
     covariance = np.zeros((m, m))
-    for j in range(1, m):
+    for j in range(1, slow):
         covariance[j, j] = ou_variance[j - 1]
+    if m > slow:
+        covariance[slow, slow] = angle
     total, has_level, last, walked, mean_variance = 0.0, False, np.nan, np.nan, 0.0
     for i in range(n):
         if step_seconds[i] != last or K2[i] != walked:
@@ -173,6 +181,9 @@ def whiten(
             mean_variance = _block_moments(
                 last, walked, ou_variance, ou_time, decay, weight, drive, shared
             )
+            if m > slow:
+                weight[slow], drive[slow], shared[slow] = -1.0 / last, angle, angle / last
+                mean_variance += angle / last**2
         if not present[i]:
             for j in range(m):
                 for c in range(width):

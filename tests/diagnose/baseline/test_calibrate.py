@@ -19,6 +19,7 @@ from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
 from gyrostab.diagnose.baseline.quiescent import find_quiescent_blocks
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.scores import cube_root_score
 from gyrostab.errors import OptionError, SchemaError
@@ -386,6 +387,43 @@ def test_a_hump_within_blocks_does_not_raise_the_noise_of_their_means():
     (nulls,) = null_records(blocks, baseline, count=20, rng=rng)
     scatter = 0.5 * nulls["mean"].diff("block").var()
     assert 0.7 < float(scatter) / white < 1.6
+
+
+def swell(seconds: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return the rate of an angle that swings with periods of about 8 s."""
+    rate, kernel = 1.0 / (seconds[1] - seconds[0]), np.arange(0.0, 40.0, seconds[1] - seconds[0])
+    shape = np.sin(2.0 * np.pi * kernel / 8.0) * np.hanning(kernel.size)
+    angle = np.convolve(rng.standard_normal(seconds.size + kernel.size), shape, "valid")
+    return np.diff(angle / angle.std(), append=0.0)[: seconds.size] * rate
+
+
+def test_waves_faster_than_a_block_are_angle_noise_of_its_mean():
+    """Means repeat the angles between blocks with opposite signs, and so do those of null records.
+
+    Noise without waves shows none.
+    """
+    plain = log({"N": 0.003}, duration="3h")
+    seconds = np.arange(plain.sizes["time"]) / 10.0
+    rms = 5.0  # arcsec, far above the 0.8 arcsec that white noise adds in a block
+    waves = plain.assign(rate=plain["rate"] + rms * swell(seconds, np.random.default_rng(8)))
+    without, blocks = reduce_log(plain), reduce_log(waves)
+    assert not calibrate_noise(without)["angle_variance"].any()
+    baseline = calibrate_noise(blocks)
+    assert np.sqrt(float(baseline["angle_variance"][0])) == pytest.approx(rms, rel=0.15)
+    (nulls,) = null_records(blocks, baseline, count=20, rng=np.random.default_rng(2))
+    for apart, expected in ((1, 6.0), (2, 4.0), (30, 4.0)):
+        scatter = [
+            float((record["mean"].shift(block=-apart) - record["mean"]).var()) * 20.0**2 / rms**2
+            for record in (blocks, nulls)
+        ]
+        assert scatter == pytest.approx([expected, expected], rel=0.2), apart
+    surface = allan_surface(nulls, baseline)
+    of_means = surface["columns"]["tau_min_s"] >= 20.0
+    ratio = (surface["observed"] / surface["expected"])[..., of_means]
+    assert np.nanmean(ratio) == pytest.approx(1.0, abs=0.1)
+    assert np.nanstd(find_statistic("mean").score(nulls, baseline)["z"]) == pytest.approx(
+        1.0, abs=0.1
+    )
 
 
 def test_null_means_have_the_noise_of_means_where_it_is_apart():

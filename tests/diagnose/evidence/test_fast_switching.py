@@ -52,6 +52,7 @@ def frame(pieces: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
         {
             "known_mean": (("axis", "block"), np.zeros((1, BLOCKS))),
             "mean_variance": (("axis", "block"), np.full((1, BLOCKS), WHITE / PIECES)),
+            "angle_variance": (("axis",), np.zeros(1)),
             **{
                 f"grid_{name}": (("axis", "grid"), grid_values)
                 for name, grid_values in grid.items()

@@ -51,6 +51,7 @@ def mean_case(
         {
             "known_mean": (("axis", "block"), np.full((1, n), 0.2)),
             "mean_variance": (("axis", "block"), variance),
+            "angle_variance": (("axis",), np.zeros(len(variance))),
             "grid_K": (grid, K[None]),
             "grid_B": (grid, B[None]),
             "grid_prior": (grid, weights[0]),

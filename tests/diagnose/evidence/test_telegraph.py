@@ -47,6 +47,7 @@ def frame(mean: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
         {
             "known_mean": (("axis", "block"), np.zeros((1, mean.shape[1]))),
             "mean_variance": (("axis", "block"), np.full((1, mean.shape[1]), WHITE)),
+            "angle_variance": (("axis",), np.zeros(1)),
             **{
                 f"grid_{name}": (("axis", "grid"), values[None])
                 for name, values in (("K", K), ("B", B), ("prior", 0.0 * K))

@@ -222,6 +222,7 @@ def _baseline_of(blocks):
             "spectrum": (("axis", "block", "band"), np.full(blocks["power"].shape, level)),
             "known_mean": (("axis", "block"), np.zeros(blocks["mean"].shape)),
             "mean_variance": (("axis", "block"), SIGMA**2 / blocks["samples"].values),
+            "angle_variance": (("axis",), np.zeros(blocks.sizes["axis"])),
             "coefficient": (("axis", "term"), np.tile([0.0, 0.003, 0.0, 0.0, 0.0], (axes, 1))),
         },
         coords={"axis": blocks["axis"], "term": list("QNBKR"), "frequency": blocks["frequency"]},

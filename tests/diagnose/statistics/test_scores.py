@@ -68,7 +68,8 @@ def test_moving_sums_have_fewer_places_at_the_ends(span):
     np.testing.assert_array_equal(moving_sum(values, span), expected)
 
 
-def test_boxcar_kernels_match_dense_algebra():
+@pytest.mark.parametrize("angle", [0.0, 4.0])
+def test_boxcar_kernels_match_dense_algebra(angle):
     rng = np.random.default_rng(5)
     n, p = 60, 3
     variance, walk, ou = (
@@ -78,10 +79,14 @@ def test_boxcar_kernels_match_dense_algebra():
     )
     decay = np.exp(-rng.uniform(0.5, 1.5, (n, 1)) / np.array([1.0, 5.0, 30.0]))
     present = rng.random(n) > 0.3
-    of_states = np.column_stack([np.ones(n), decay])
-    innovation, gain = filter_gains(variance, present, walk, ou, of_states)
+    # the angle at the start of a block; that at its end is also white noise of the observation
+    of_states, squares = np.column_stack([np.ones(n), decay, np.zeros(n)]), np.append(ou, angle)
+    shared = np.append(np.zeros(p + 1), -angle)
+    innovation, gain = filter_gains(variance + angle, present, walk, squares, of_states, shared)
     noise = innovation, gain, of_states
-    inverse = np.linalg.inv(_dense_covariance(variance, present, walk, ou, decay))
+    of_angle = 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    dense = _dense_covariance(variance, present, walk, ou, decay)
+    inverse = np.linalg.inv(dense + angle * of_angle[np.ix_(present, present)])
     series = rng.normal(size=(2, n))
     out = precision_times(series, *noise)
     np.testing.assert_allclose(out[:, present], series[:, present] @ inverse, rtol=1e-9)

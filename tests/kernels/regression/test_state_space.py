@@ -30,12 +30,14 @@ def relaxation_covariance(edges: np.ndarray, time: float) -> np.ndarray:
     return covariance
 
 
-def dense(columns, variance, step, present, K2, ou_variance, ou_time):
+def dense(columns, variance, step, present, K2, ou_variance, ou_time, angle=0.0):
     edges = np.concatenate([[0.0], np.cumsum(step)])
     # it walks by its own clock
     V = np.diag(variance) + walk_covariance(np.concatenate([[0.0], np.cumsum(K2 * step)]))
     for v, time in zip(ou_variance, ou_time, strict=True):
         V = V + v * relaxation_covariance(edges, time)
+    differences = (np.eye(step.size, step.size + 1, 1) - np.eye(step.size, step.size + 1)).T / step
+    V = V + angle * differences.T @ differences
     V, X, constant = V[np.ix_(present, present)], columns[present], np.ones(present.sum())
     L = np.linalg.cholesky(V)
     A, u = np.linalg.solve(L, X), np.linalg.solve(L, constant)
@@ -48,8 +50,11 @@ def dense(columns, variance, step, present, K2, ou_variance, ou_time):
     missing=st.floats(0.0, 0.8),
     K=st.sampled_from([0.0, 0.01, 1.0]),
     processes=st.integers(0, 5),
+    angle=st.sampled_from([0.0, 30.0, 1e4]),
 )
-def test_products_and_determinant_equal_those_of_the_dense_covariance(seed, missing, K, processes):
+def test_products_and_determinant_equal_those_of_the_dense_covariance(
+    seed, missing, K, processes, angle
+):
     rng = np.random.default_rng(seed)
     n = 60
     step = np.full(n, 20.0) if seed % 2 else rng.uniform(1.0, 30.0, n)
@@ -66,6 +71,7 @@ def test_products_and_determinant_equal_those_of_the_dense_covariance(seed, miss
         K2,
         rng.uniform(0.1, 3.0, processes),
         10.0 ** rng.uniform(0.0, 5.0, processes),
+        angle,
     )
     whitened, log_determinant = whiten(*case)
     products, expected = dense(*case)
