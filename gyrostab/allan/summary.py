@@ -293,7 +293,7 @@ def _describe_misfit(product: xr.Dataset) -> list[str]:
     if not fits:
         return []
     ratios = ", ".join(f"{fit.axis} {_number_text(fit.chi2_per_dof)}" for fit in fits)
-    lines = [f"Misfit, median chi2/dof (1 is ideal): {ratios}."]
+    lines = [f"Misfit, median chi2/dof (0.8 to 1 where the terms describe the noise): {ratios}."]
     failing = [
         f"{fit.axis} in {_share_or_all(fit.failing_share)} of its windows"
         for fit in fits
