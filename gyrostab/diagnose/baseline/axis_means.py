@@ -6,17 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import Bounds, OptimizeResult, minimize
 
 from gyrostab.diagnose.evidence.products import marginalise, mean_products, scale_columns
 from gyrostab.diagnose.evidence.wandering import RandomProcesses
-from gyrostab.diagnose.settings import Settings
 
 Array = NDArray[np.float64]
-#: Every so many values of K and B are tried with angle noise; saves time.
-_STRIDE = 2
-#: Variances of angle noise are tried from three times that of all the scatter down to a sixtieth of
-#: it. Half a step from the likeliest one, the likelihood of 500 means falls by 1 nat.
-_ANGLE_RATIO, _ANGLE_STEPS = 1.2, np.arange(26)
+_MIN_MEANS = 4  # to tell K, B and angle noise apart
+#: Variances of angle noise that are tried, over that which makes all of the scatter: less is not
+#: visible next to white noise.
+_ANGLE_RANGE = 0.03, 3.0
+_SHORT_STEP = 1e-3  # of a logarithm, for gradients; far below any error, above rounding
 _PRIOR_PRECISION = 1e-9  # of effects in the means, over that of one mean; nearly free
 
 
@@ -48,19 +48,53 @@ class AxisMeans(NamedTuple):
         products = marginalise(products, columns.shape[1], precision)
         return np.asarray(-0.5 * (products.square[:, 0] + products.log_determinant))
 
-    def with_angle_noise(self, K: Array, B: Array, settings: Settings) -> AxisMeans:
-        """Return the means with the likeliest angle noise, if they show any.
+    def with_angle_noise(
+        self, K: Array, B: Array, likelihood: Array, least_nats: float
+    ) -> AxisMeans:
+        """Return the means with the likeliest angle noise, if it makes them more likely.
 
-        K and B are ascending values of which pairs are tried with it.
+        Parameters
+        ----------
+        K, B, likelihood : ndarray, shape (point,)
+            Random walk and flicker from the least to the largest, and the log likelihood without
+            angle noise.
+        least_nats : float
+            Log likelihood that angle noise must add [nats].
         """
-        scatter = np.diff(self.values[self.present, 0]).var() if self.present.any() else 0.0
-        K, B = (part.ravel() for part in np.meshgrid(K[::_STRIDE], B[::_STRIDE]))
-        variances = np.append(0.0, self.step**2 * scatter / 2.0 / _ANGLE_RATIO**_ANGLE_STEPS)
-        trials = [
-            self._replace(wander=self.wander._replace(angle=np.array(variance)))
-            for variance in variances
-        ]
-        likelihood = [trial.log_likelihood(K, B).max() for trial in trials]
-        best = int(np.argmax(likelihood))
-        has_angle_noise = likelihood[best] - likelihood[0] > settings.ambiguous_nats
-        return trials[best] if has_angle_noise else self
+        if self.present.sum() < _MIN_MEANS:
+            return self
+        scatter = float(np.diff(self.values[self.present, 0]).var())
+        ends = np.log([[K.min(), K.max()], [B.min(), B.max()]])
+        start = np.log([K[likelihood.argmax()], B[likelihood.argmax()]])
+        without = self._find_peak(start, ends)
+        # six of it are in the difference of two means
+        angle = np.log(self.step**2 * scatter / 6.0)
+        ends = np.vstack([ends, angle + np.log(_ANGLE_RANGE)])
+        with_angle = min(
+            (
+                self._find_peak(np.append(slow, angle), ends)
+                for slow in (without.x, ends[:2].mean(axis=1))
+            ),
+            key=lambda result: float(result.fun),
+        )
+        added_nats = without.fun - with_angle.fun
+        return self._with_angle(with_angle.x[2]) if added_nats > least_nats else self
+
+    def _with_angle(self, log_variance: float) -> AxisMeans:
+        return self._replace(wander=self.wander._replace(angle=np.exp(np.array(log_variance))))
+
+    def _find_peak(self, start: Array, ends: Array) -> OptimizeResult:
+        """Find the largest likelihood of log K, log B and perhaps the log variance of the angle."""
+
+        def negative_likelihood(point: Array) -> float:
+            means = self._with_angle(point[2]) if point.size > 2 else self
+            K, B = np.exp(point[:2])
+            return -float(means.log_likelihood(np.array([K]), np.array([B]))[0])
+
+        return minimize(
+            negative_likelihood,
+            start,
+            method="L-BFGS-B",
+            bounds=Bounds(*ends.T),
+            options={"eps": _SHORT_STEP},
+        )

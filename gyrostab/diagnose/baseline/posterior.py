@@ -315,8 +315,10 @@ def noise_posterior(
         present,
         no_processes(mean.size) if wander is None else wander,
     )
-    means = means.with_angle_noise(coarse_K, coarse_B, settings)
     slow = means.log_likelihood(K, B)
+    with_angle = means.with_angle_noise(K, B, slow, settings.ambiguous_nats)
+    if with_angle is not means:
+        means, slow = with_angle, with_angle.log_likelihood(K, B)
     fast, best, normal = _likelihood_of_powers(fit, spectrum, K, B)
     joined = bool(slow.max() + fast.max() - (slow + fast).max() < settings.disagreement_nats)
     log = slow + fast if joined else slow
