@@ -30,6 +30,7 @@ from gyrostab.schema import OBSERVABLE
 from tests.reference import average_plainly, fit_window_plainly
 from tests.support.noise_records import flicker, lose, quantization, random_walk, white
 from tests.support.published import fit_deviations
+from tests.support.repetitions import first_of
 
 RATE = 100.0
 #: Sides of an interval: scores of its lower and upper bound.
@@ -172,7 +173,7 @@ def test_flicker_noise_alone_gives_b():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("share", [0.0, 0.2])
+@pytest.mark.parametrize("share", first_of(0.2, 0.0))
 def test_absent_terms_are_rarely_observed_and_their_limits_hold(share):
     """With white noise only, absent terms are observed in about 1 % of windows."""
     rng = np.random.default_rng([6, int(share * 10)])
@@ -198,7 +199,7 @@ def test_absent_terms_are_rarely_observed_and_their_limits_hold(share):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("term", "value"), [("B", 0.6), ("K", 45.0)])
-@pytest.mark.parametrize("share", [0.0, 0.3])
+@pytest.mark.parametrize("share", first_of(0.3, 0.0))
 def test_truth_exceeds_a_limit_in_5_percent_of_windows(term, value, share):
     """A term at the edge of visibility: 2 to 8 %, three standard deviations about 5."""
     rng = np.random.default_rng([7, int(share * 10)])

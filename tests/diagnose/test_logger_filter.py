@@ -12,7 +12,7 @@ from gyrostab.ingest.make_log import make_log
 RATE, CUTOFF, OVERSAMPLING = 10.0, 1.0, 10
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_filter_is_identified_with_its_cutoff_and_the_noise_without_it() -> None:
     """Four seeds give cutoffs of 0.95 to 1.03 Hz, and N within 5 %."""
     fine = np.random.default_rng(2).standard_normal((2, 9000 * OVERSAMPLING))

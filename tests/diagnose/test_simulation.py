@@ -70,7 +70,7 @@ def test_steady_effects_of_the_simulation_are_not_mismatches(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lacking", ["shared_source", "line"])
+@pytest.mark.parametrize("lacking", first_of("line", "shared_source"))
 def test_effect_in_addition_to_the_simulation_is_identified(lacking):
     names = ("shared_source", "line", "bump")
     simulation = simulate_axes(111, *(name for name in names if name != lacking))

@@ -88,7 +88,7 @@ def test_expected_powers_are_those_of_simulated_noise(term, size):
         )
 
 
-@pytest.mark.parametrize("lost", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
+@pytest.mark.parametrize("lost", [pytest.param(0.0, marks=pytest.mark.full), 0.3])
 def test_coefficients_are_within_their_errors(lost):
     noise = {"Q": 0.5, "N": 0.003, "B": 0.004, "K": 0.1}
     axes = tuple("abcdefghijkl")

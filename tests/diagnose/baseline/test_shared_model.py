@@ -13,7 +13,6 @@ from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate
-from tests.support.repetitions import first_of
 
 NOISE = {"N": 0.003, "K": 0.02}
 
@@ -118,8 +117,8 @@ def test_phases_and_signs_of_axes_are_in_the_cross_spectra():
     assert baseline["cross"].isel(band=band).mean("block").values[0].real < 0.0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", first_of(1, 2))
+@pytest.mark.full
+@pytest.mark.parametrize("seed", [1, 2])
 def test_common_noise_of_the_model_is_not_a_mismatch(seed):
     diagnosis = gyrostab.diagnose(
         log_of(seed, 0.0015), simulation={"noise": NOISE, "effect": [shared(0.0015)]}, nulls=100

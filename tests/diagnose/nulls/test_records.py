@@ -17,6 +17,7 @@ from gyrostab.diagnose.reduce.outliers import EXPECTED_FALSE_OUTLIERS
 from gyrostab.kernels.spectra.periodogram import band_covariance
 from gyrostab.simulate import simulate
 from tests.support.evidence import mean_evidence, power_evidence
+from tests.support.repetitions import first_of
 
 NOISE = {"Q": 0.05, "N": 0.003, "B": 0.004, "K": 0.02}
 RECORDS = 30
@@ -72,7 +73,7 @@ def close(expected: xr.DataArray, drawn: xr.DataArray, *, rel: float) -> None:
     assert float(expected.std()) == pytest.approx(scale, rel=rel)
 
 
-@pytest.mark.parametrize("lost", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
+@pytest.mark.parametrize("lost", [pytest.param(0.0, marks=pytest.mark.full), 0.3])
 def test_statistics_match_those_of_raw_logs(lost):
     raw_records, nulls = both(lost)
     for name in ("power", "mean", "cross", "line_power", "kurtosis"):
@@ -110,7 +111,7 @@ def test_statistics_match_those_of_raw_logs(lost):
     )
 
 
-@pytest.mark.parametrize("lost", [0.3, pytest.param(0.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("lost", first_of(0.3, 0.0))
 def test_covariance_of_neighbouring_bands_matches_raw_logs(lost):
     shares = []
     for records in both(lost):
@@ -279,7 +280,7 @@ def candidates(record: xr.Dataset) -> tuple[dict, dict]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lost", [0.3, 0.0])
+@pytest.mark.parametrize("lost", first_of(0.3, 0.0))
 def test_largest_evidence_of_raw_logs_matches_null_records(lost):
     """The rank of raw records among null records of their separate calibrations is uniform."""
     count, records = 29, 16

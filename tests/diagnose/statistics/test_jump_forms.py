@@ -167,7 +167,7 @@ def test_a_slow_course_is_not_a_jump_at_every_restart() -> None:
     assert [component.row for component in keep_physical(components, state)[0]] == [("y",)]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("seed", [1])
 def test_jumps_at_all_restarts_are_sized(seed: int) -> None:
     times = tuple(end for _, end in RESTARTS)

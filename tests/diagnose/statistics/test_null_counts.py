@@ -123,7 +123,7 @@ def test_grid_hides_repeats_only_where_noise_is_not_normal():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("step", [1e-4, 0.5])
+@pytest.mark.parametrize("step", first_of(0.5, 1e-4))
 def test_grid_alone_is_no_effect(step: float):
     diagnosis = gyrostab.diagnose(log_of(np.round(noise("white") / step) * step), nulls=100)
     assert not {"held_samples", "dead_zone", "clipping"} & {
