@@ -76,22 +76,23 @@ WORLD: dict[str, tuple[dict[str, Any], ...]] = {
 def record(
     effects: list[dict[str, Any]],
     *,
+    axes: str = "xyz",
     environment: Any = WORLD["usual"],
     seed: int = 1,
     drop: tuple[str, ...] = (),
 ) -> xr.Dataset:
-    """Return cached block statistics of three axes for these arguments."""
-    blocks = _make_record(json.dumps(effects), json.dumps(list(environment)), seed)
+    """Return cached block statistics for these arguments."""
+    blocks = _make_record(json.dumps(effects), axes, json.dumps(list(environment)), seed)
     return blocks.drop_vars([f"channel_{name}" for name in drop])
 
 
 @cache
-def _make_record(effects: str, environment: str, seed: int) -> xr.Dataset:
+def _make_record(effects: str, axes: str, environment: str, seed: int) -> xr.Dataset:
     model = {
         "noise": NOISE,
         "effect": json.loads(effects),
         "environment": json.loads(environment),
-        "log": {"axes": ["x", "y", "z"]},
+        "log": {"axes": list(axes)},
     }
     return reduce_log(simulate(model, duration="1h", rate=10.0, seed=seed).compute())
 

@@ -58,7 +58,7 @@ def test_noise_behind_a_low_pass_is_that_of_the_instrument(seed: int) -> None:
 )
 def test_average_is_named_with_its_length(taps: int, seed: int) -> None:
     """A low-pass of one pole at a quarter of the rate is the average of two samples."""
-    blocks = filtered_blocks([1.0 / taps] * taps, [1.0], seed, size=12_000)
+    blocks = filtered_blocks([1.0 / taps] * taps, [1.0], seed, size=9_000)
     baseline, records = nulls(blocks, 10)
     identifications = name_effects(blocks, baseline, records)
     assert not identifications.unknown

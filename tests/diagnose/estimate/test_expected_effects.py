@@ -55,7 +55,7 @@ def diagnose_against_model(effects, *, environment=(), more=(), axes="xyz", seed
         ([SPIKES, MEMORY, WALK], (SHAKE,), "xyz"),
         pytest.param([HELD], (), "xy", marks=pytest.mark.full),
         pytest.param([SWAY], (), "xy", marks=pytest.mark.full),
-        ([EARTH, SCALE], (TURN,), "xyz"),
+        ([EARTH, SCALE], (TURN,), "yz"),
     ],
     ids=["spikes, memory, walk", "held samples", "sway", "turning"],
 )

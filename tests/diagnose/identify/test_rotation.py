@@ -187,7 +187,7 @@ def test_earth_rate_is_the_only_effect_on_a_tool_that_starts_to_rotate(
     """
     rotation = {
         "profile": "rotation",
-        "points": [[0, 0], [900, 0], [910, speed], [3000, speed], [3010, 0]],
+        "points": [[0, 0], [600, 0], [610, speed], [1800, speed], [1810, 0]],
         "sensor_rate": 50,
         "stick_slip": stick_slip,
         "period": "4 s",
@@ -199,7 +199,7 @@ def test_earth_rate_is_the_only_effect_on_a_tool_that_starts_to_rotate(
         "environment": [rotation],
         "effect": [earth],
     }
-    log = simulate(model, duration="1h", rate=10.0, seed=3).compute()
+    log = simulate(model, duration="40min", rate=10.0, seed=3).compute()
     found = diagnose(log, nulls=100, seed=1)
     (effect,) = found.effects
     assert (effect["name"], effect["axes"]) == ("earth_rate", ["x", "y"])

@@ -99,7 +99,7 @@ def test_an_unrelated_channel_is_no_better_than_its_surrogates(monkeypatch):
 
 RATE, BLOCKS, SAMPLES = 5.0, 90, 100  # Hz, blocks of 20 s, samples of each
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
-FAST, FULL = 60, 300  # records
+FAST, FULL = 40, 300  # records
 
 
 def draw_channel(kind: str, rng: np.random.Generator) -> np.ndarray:

@@ -79,7 +79,7 @@ def _baseline_and_null(missing):
 def test_burst_of_noise_has_a_region(share, missing):
     base, null = _baseline_and_null(missing)
     overlaps = []
-    for seed in range(9):
+    for seed in range(5):
         blocks = records(base, 1, np.random.default_rng(seed), missing=missing).isel(record=0)
         blocks["power"][1, 75:90] *= 1.0 + share**2
         regions = [
@@ -99,7 +99,7 @@ def test_burst_of_noise_has_a_region(share, missing):
 
 def test_step_of_the_mean_has_a_region(base, null):
     overlaps = []
-    for seed in range(9):
+    for seed in range(5):
         blocks = records(base, 1, np.random.default_rng(seed)).isel(record=0)
         blocks["mean"][0, 30:45] += 0.1
         blocks["mean"][0, 120:140] -= 0.1

@@ -268,7 +268,7 @@ def lose_samples(kind, share, rows, random):
 )
 def test_random_losses_with_jitter_do_not_change_the_rate(kind, share, jitter, unit):
     random = np.random.default_rng(9)
-    samples = lose_samples(kind, share, 20_000, random)
+    samples = lose_samples(kind, share, 10_000, random)
     stamps = stamps_of(samples + random.normal(0.0, jitter, samples.size), 400.0)
     log = regularise(raw_log(stamps // unit * unit))
     assert log.attrs["sampling_rate_hz"] == pytest.approx(400.0, rel=1e-5)
