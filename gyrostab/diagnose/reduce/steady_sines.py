@@ -61,7 +61,7 @@ class _Spectrum:
         self.band_largest[axis] = np.maximum(self.band_largest[axis], level)
 
     def equal_count(self) -> Array:
-        """Return (axis, frequency) how many equal periodograms have a sum with this upper tail.
+        """Return (axis, band) how many equal periodograms have a sum with this upper tail.
 
         A noisier stretch leaves fewer: with a single one, the sum is an exponential variable.
         """
@@ -69,7 +69,7 @@ class _Spectrum:
         mean = np.where(self.band_total > 0.0, self.band_total / used, 1.0)
         excess = self.band_largest / mean
         is_equal = excess < 1.0 + _EQUAL_SIGMA * np.sqrt(_FINER / self.widths)
-        return np.repeat(used / np.where(is_equal, 1.0, excess), self.widths, axis=1)
+        return used / np.where(is_equal, 1.0, excess)
 
 
 class SineSearch:
@@ -140,10 +140,14 @@ class SineSearch:
         usable = (spectrum.used > 0) & spectrum.total.any(axis=1)  # a constant axis has no noise
         if frequency.size < _MIN_LEVELS * width or not usable.any():
             return None
-        count = spectrum.equal_count()[:, inside]
+        of_bands = spectrum.equal_count()
+        count, median = (
+            np.repeat(part, spectrum.widths, axis=1)[:, inside]
+            for part in (of_bands, gammaincinv(of_bands, 0.5) / of_bands)
+        )
         mean = spectrum.total[:, inside] / np.maximum(spectrum.used, 1)[:, None]
         power = np.where(usable[:, None], mean, 1.0)
-        level = level_around(power, width, side) / (gammaincinv(count, 0.5) / count)
+        level = level_around(power, width, side) / median
         factor = np.where(usable[:, None], sine_factors(power / level, count), -np.inf)
         place = np.clip(np.rint(frequency / lines[0]).astype(np.int64) - 1, 0, lines.size - 1)
         # An axis has the sine or not; one frequency of all that were tried.
