@@ -287,7 +287,7 @@ def _open(address: str, path: Path) -> None:
 
 
 def test_a_scheduler_without_workers(monkeypatch):
-    monkeypatch.setattr("gyrostab.jobs.schedule._CONNECT_TIMEOUT_S", 3.0)
+    monkeypatch.setattr("gyrostab.jobs.schedule._CONNECT_TIMEOUT_S", 1.0)
     cluster = distributed.LocalCluster(
         n_workers=0, dashboard_address=":0", processes=True, silence_logs=50
     )
@@ -372,7 +372,7 @@ def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
 
     monkeypatch.setattr(engine, "write_block", write)
     monkeypatch.setattr(engine, "_MAX_HELD_SECONDS", 0.0)
-    monkeypatch.setattr(schedule, "_CONNECT_TIMEOUT_S", 4.0)  # also that of a reconnection
+    monkeypatch.setattr(schedule, "_CONNECT_TIMEOUT_S", 2.0)  # also that of a reconnection
     begun = time.monotonic()
     assert main(["run", str(log), "-o", str(output), "--scheduler", address, *WINDOW_OPTIONS]) == 2
     assert time.monotonic() - begun < 60
@@ -400,7 +400,7 @@ def test_a_fleet_whose_scheduler_dies_goes_on(tmp_path, monkeypatch, capfd, is_r
         to_netcdf(_log().isel(time=slice(0, 20_000 + number)), folder / "log.nc")
     command = ["fleet", str(tmp_path / "archive"), "-o", str(tmp_path / "fleet"), "--no-reports"]
     command += [*WINDOW_OPTIONS]
-    monkeypatch.setattr(schedule, "_CONNECT_TIMEOUT_S", 4.0)  # also that of a reconnection
+    monkeypatch.setattr(schedule, "_CONNECT_TIMEOUT_S", 2.0)  # also that of a reconnection
     real = fleet.run_calls
     cluster = start_cluster(tmp_path, workers=1) if is_real else nullcontext(("threads", None))
     with cluster as (address, scheduler):
