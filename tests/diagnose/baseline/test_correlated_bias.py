@@ -126,8 +126,9 @@ def test_a_bias_with_another_spectrum_is_found_once():
     assert evidence.evidence_nats[0, 0] < 0.0
 
 
+@pytest.mark.slow
 def test_bias_is_named_on_its_axis_and_may_be_a_telegraph():
-    log = simulate(_make_model(NOISE, 0.2, 15.0), duration="20min", rate=10.0, seed=8)
+    log = simulate(_make_model(NOISE, 0.2, 15.0), duration="30min", rate=10.0, seed=8)
     content = json.loads(diagnose(log, nulls=100).to_json())
     (effect,) = content["effects"]
     assert (effect["name"], effect["axes"]) == ("gauss_markov", ["x"])
