@@ -170,20 +170,22 @@ def test_axis_lost_early_keeps_blocks_with_anomalous_samples():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fill", ["repeat", pytest.param("zero", marks=pytest.mark.full)])
-def test_number_and_length_of_held_samples_are_estimated(fill):
-    """Held stretches: 40 of 6 samples, and 20 of 2."""
+@pytest.mark.parametrize(
+    ("fill", "axes"), [("repeat", "x"), pytest.param("zero", "xyz", marks=pytest.mark.full)]
+)
+def test_number_and_length_of_held_samples_are_estimated(fill, axes):
+    """Held stretches: 40 of 6 samples, and 20 of 2; zeros of one axis may be a dead zone."""
     rng = np.random.default_rng(8)
-    noise = SCATTER * rng.standard_normal((1, 15_000))
+    noise = SCATTER * rng.standard_normal((len(axes), 15_000))
     for number, first in enumerate(
         np.sort(rng.choice(np.arange(50, 14_900, 30), 60, replace=False))
     ):
         length = 6 if number < 40 else 2
         noise[:, first : first + length] = noise[:, first - 1 : first] if fill == "repeat" else 0.0
-    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x"]))
+    blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=list(axes)))
     baseline, records = nulls(blocks, 40)
     fitted_effects = fit_identifications(name_effects(blocks, baseline, records), baseline)
-    assert [fitted.axes for fitted in fitted_effects] == [("x",)]
+    assert [fitted.axes for fitted in fitted_effects] == [tuple(axes)]
     assert [fitted.effect.fill for fitted in fitted_effects if fitted.effect] == [fill]
     hours = float(blocks["samples"].sel(axis="x").sum()) / 36_000.0
     for fitted in fitted_effects:
