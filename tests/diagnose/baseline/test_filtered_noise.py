@@ -47,6 +47,7 @@ def test_noise_behind_a_low_pass_is_that_of_the_instrument(seed: int) -> None:
     assert baseline["coefficient"].sel(term="N").values == pytest.approx([N, 1.1 * N], rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("taps", "seed"),
     [

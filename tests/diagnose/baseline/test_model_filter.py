@@ -50,6 +50,7 @@ def test_a_model_expects_its_own_filter(filtering):
     assert np.abs(ratio - 1.0).max() < 5.0 / np.sqrt(2.0 * count)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("filtering", first_of({"cutoff": 2.0}, {"length": 0.5}), ids=str)
 @pytest.mark.usefixtures("one_thread")
 def test_a_recording_does_not_differ_from_its_own_filter(filtering):

@@ -197,6 +197,7 @@ def test_number_and_length_of_held_samples_are_estimated(fill, axes):
             assert fitted.parameters[name].low < true < fitted.parameters[name].high
 
 
+@pytest.mark.slow
 def test_held_samples_of_independent_axes_are_separate_effects():
     """Axes x and y repeat their samples together; z repeats its own at other instants."""
     rng = np.random.default_rng(9)

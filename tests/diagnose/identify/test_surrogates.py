@@ -204,6 +204,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "count"),
     [(CASES[0], FAST), *(pytest.param(case, FULL, marks=pytest.mark.full) for case in CASES)],
