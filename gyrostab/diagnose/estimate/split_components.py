@@ -61,8 +61,8 @@ def split_steps(
     """Split the components of steps at several times, each with the other steps in the model.
 
     Steps of different axes are one if hardly any block lies between their times. The grid of times
-    of each step ends half way to the others: at their times it could not be distinguished from
-    them.
+    of each step ends half way to the others of its axis: at their times it could not be
+    distinguished from them.
     """
     steps = [step for component in components for step in _single_steps(component)]
     groups = _group_steps(steps, state)
@@ -72,7 +72,7 @@ def split_steps(
     for group in groups:
         others = [step for other in groups if other is not group for step in other]
         with_others = condition_on_components(state, others)
-        nearest = [_nearest_times(step, [_step_time(other) for other in others]) for step in group]
+        nearest = [_nearest_times(step, others) for step in group]
         out.append((nearest, replace(state, given=with_others.given)))
     return out
 
@@ -118,12 +118,13 @@ def _group_steps(steps: Sequence[Component], state: State) -> list[list[Componen
     return groups
 
 
-def _nearest_times(step: Component, other_times: Sequence[float]) -> Component:
-    """Return a step with only those times of its grid that are nearer to it than to others."""
+def _nearest_times(step: Component, others: Sequence[Component]) -> Component:
+    """Return a step with only those times that are nearer to it than to others of its axis."""
+    other_times = [_step_time(other) for other in others if other.row == step.row]
 
     def is_nearest(variant: Variant) -> bool:
         time = float(variant.values[TIME_PARAMETER])
-        return abs(time - _step_time(step)) < min(abs(time - other) for other in other_times)
+        return all(abs(time - _step_time(step)) < abs(time - other) for other in other_times)
 
     nearest = tuple(filter(is_nearest, step.candidate.variants))
     return replace(step, candidate=replace(step.candidate, variants=nearest))

@@ -20,7 +20,7 @@ _TRANSITION_BLOCKS = (4, 8)  # lengths of the gradual changes that a jump is com
 EVENT_LENGTHS = 48  # that are tried, from two blocks up
 MIN_EVENT_LIMIT_BLOCKS = 8.0
 MIN_LEVEL_BLOCKS = 3  # before and after an event, that determine the level there
-_VARIANCE_FACTORS = (10.0, 100.0, 1e3, 1e4, 1e5)  # over the usual variance of the means
+_VARIANCE_FACTORS = (10.0, 100.0, 1e3, 1e4, 1e5)  # over that of white and angle noise of a mean
 
 
 def is_free_jump(component: Component, state: State) -> bool:
@@ -75,6 +75,17 @@ def jump_competitors(
     search = np.log(len(jumps[0].candidate.variants)) + (len(jumps) - 1) * np.log(2.0)
     scatter = float(search - sum(_evidence_in_scatter(jump, state) for jump in jumps))
     yield Competitor("means that scatter for a while", scatter, settings.ambiguous_nats)
+
+
+def scatter_competitors(component: Component, state: State) -> Iterator[Competitor]:
+    """Yield means that scatter for a while, which compete with a jump on one axis.
+
+    A real change on another axis, at another instant, is no evidence of this jump. That the instant
+    was sought counts for all axes together, in `jump_competitors`.
+    """
+    if is_free_jump(component, state):
+        nats = -_evidence_in_scatter(component, state)
+        yield Competitor("means that scatter for a while", nats, 0.0)
 
 
 def restart_competitors(component: Component, state: State) -> Iterator[Competitor]:
@@ -137,9 +148,8 @@ def _possible_variances(component: Component, state: State) -> list[Array]:
     """Return white variances of the means: the usual, and larger ones for a time near the jump."""
     axis, block_count = component.row[0], state.blocks.sizes["block"]
     block = np.arange(block_count)
-    at = round(
-        float(component.variant.values[TIME_PARAMETER]) / float(state.blocks.attrs["block_s"])
-    )
+    block_s = float(state.blocks.attrs["block_s"])
+    at = round(float(component.variant.values[TIME_PARAMETER]) / block_s)
     lengths = [2**power for power in range(1, max(block_count, 2).bit_length())]
     spans = {
         (max(at - blocks_before, 0), min(at + blocks_after, block_count))
@@ -147,11 +157,12 @@ def _possible_variances(component: Component, state: State) -> list[Array]:
         for blocks_before, blocks_after in ((length, length), (0, length), (length, 0))
     }
     usual = axis_values(state.baseline, "mean_variance", axis)
+    of_angle = 2.0 * float(axis_values(state.baseline, "angle_variance", axis)) / block_s**2
     inside = [(block >= first) & (block < stop) for first, stop in sorted(spans)]
     return [
         usual,
         *(
-            np.where(is_inside, factor * usual, usual)
+            np.where(is_inside, factor * (usual + of_angle), usual)
             for is_inside in inside
             for factor in _VARIANCE_FACTORS
         ),

@@ -30,7 +30,11 @@ from gyrostab.diagnose.predict.sizes import mean_mixture
 from gyrostab.diagnose.predict.windows import hat_functions, power_on_times
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, column_choices
-from gyrostab.diagnose.statistics.jump_forms import jump_competitors, restart_competitors
+from gyrostab.diagnose.statistics.jump_forms import (
+    jump_competitors,
+    restart_competitors,
+    scatter_competitors,
+)
 from gyrostab.diagnose.statistics.scores import (
     Array,
     Windows,
@@ -124,7 +128,8 @@ class Mean(BlockMeanStatistic):
         return jump_competitors(components, state, error)
 
     def axis_competitors(self, component: Component, state: State) -> Iterator[Competitor]:
-        return restart_competitors(component, state)
+        yield from restart_competitors(component, state)
+        yield from scatter_competitors(component, state)
 
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
         """Return a bias that wanders in any way."""

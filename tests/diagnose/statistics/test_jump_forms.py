@@ -10,6 +10,7 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
+from gyrostab.diagnose.estimate.split_components import split_steps
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.identifiability import find_equivalent_effects, keep_physical
 from gyrostab.diagnose.predict.candidates import Candidate, Component
@@ -78,6 +79,40 @@ def test_an_instant_that_axes_share_is_searched_once() -> None:
     assert len(components) == len(axes)
     assert sum_evidence(components) > 15.0
     assert not winning_forms(components, state)
+    assert len(keep_physical(components, state)[0]) == len(axes)
+
+
+def test_scatter_on_one_axis_is_no_jump_beside_that_of_another_axis() -> None:
+    """Axis x has three noisy blocks, axis y a jump at another time."""
+    second = np.arange(9_000) / 5.0
+    rate = 0.003 * 60.0 * np.sqrt(5.0) * np.random.default_rng(1).standard_normal((2, second.size))
+    for first, size in ((600.0, -1.0), (620.0, 1.5), (640.0, -0.6)):
+        rate[0] += size * ((second >= first) & (second < first + 20.0))
+    rate[1] += 0.3 * (second >= 1300.0)
+    blocks = reduce_log(make_log(rate, rate=5.0, unit="deg/h"))
+    jumps, state = try_jumps(blocks, baseline_from_model(blocks, MODEL))
+    components = find_components([jumps], state)[jumps.key]
+    assert {component.row for component in components} == {("x",), ("y",)}
+    kept, _ = keep_physical(components, state)
+    assert [(part.row, part.variant.values["at"]) for part in kept] == [(("y",), 1300.0)]
+
+
+def test_steps_of_other_axes_do_not_limit_the_times_of_a_step() -> None:
+    """Axis y has steps at two instants; that of x at the second one belongs to the first group."""
+    second = np.arange(9_000) / 5.0
+    rate = np.random.default_rng(1).standard_normal((2, second.size))
+    blocks = reduce_log(make_log(rate, rate=5.0, unit="deg/h"))
+    jumps, state = try_jumps(blocks, baseline_from_model(blocks, MODEL))
+    at = {variant.values["at"]: variant for variant in jumps.variants}
+    first, then = sorted(at)[len(at) // 2 :][:2]
+    steps = [
+        Component(jumps, at[time], (axis,), 20.0)
+        for axis, time in (("y", first), ("x", then), ("y", then))
+    ]
+    parts = split_steps(steps, state)
+    assert [[step.row for step in part] for part, _ in parts] == [[("y",), ("x",)], [("y",)]]
+    for part, _ in parts:
+        assert all(step.candidate.variants for step in part)
 
 
 def test_jump_at_a_restart_may_settle() -> None:
