@@ -80,7 +80,7 @@ def jump_competitors(
 def scatter_competitors(component: Component, state: State) -> Iterator[Competitor]:
     """Yield means that scatter for a while, which compete with a jump on one axis.
 
-    A real change on another axis, at another instant, is no evidence of this jump. That the instant
+    A real change of another axis at another time does not support this jump. That the instant
     was sought counts for all axes together, in `jump_competitors`.
     """
     if is_free_jump(component, state):
