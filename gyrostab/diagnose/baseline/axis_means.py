@@ -10,8 +10,12 @@ from scipy.optimize import Bounds, OptimizeResult, minimize
 
 from gyrostab.diagnose.evidence.products import marginalise, mean_products, scale_columns
 from gyrostab.diagnose.evidence.wandering import RandomProcesses
+from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
+#: K and B are tried up to this multiple of the scatter of neighbouring means. Design choice: far
+#: above, because too low a limit makes a bias or angle noise of what is their noise.
+MAX_SCATTER = 3.0
 _MIN_MEANS = 4  # to tell K, B and angle noise apart
 #: Variances of angle noise that are tried, over that which makes all of the scatter: less is not
 #: visible next to white noise.
@@ -56,15 +60,16 @@ class AxisMeans(NamedTuple):
         Parameters
         ----------
         K, B, likelihood : ndarray, shape (point,)
-            Random walk and flicker from the least to the largest, and the log likelihood without
-            angle noise.
+            Random walk and flicker, and the log likelihood without angle noise. Larger ones are
+            tried too, as far as the means scatter: they may explain what angle noise would.
         least_nats : float
             Log likelihood that angle noise must add [nats].
         """
         if self.present.sum() < _MIN_MEANS:
             return self
         scatter = float(np.diff(self.values[self.present, 0]).var())
-        ends = np.log([[K.min(), K.max()], [B.min(), B.max()]])
+        most = MAX_SCATTER * np.sqrt(scatter) * np.array([np.sqrt(HOUR / self.step), 1.0])
+        ends = np.log([[K.min(), max(K.max(), most[0])], [B.min(), max(B.max(), most[1])]])
         start = np.log([K[likelihood.argmax()], B[likelihood.argmax()]])
         without = self._find_peak(start, ends)
         # six of it are in the difference of two means

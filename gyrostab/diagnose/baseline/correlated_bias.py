@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import Bounds, minimize
 
-from gyrostab.diagnose.baseline.axis_means import AxisMeans
+from gyrostab.diagnose.baseline.axis_means import MAX_SCATTER, AxisMeans
 from gyrostab.diagnose.baseline.expected_statistics import (
     common_variance,
     separate_share,
@@ -47,9 +47,6 @@ from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
 _MIN_NOISE_SHARE = 0.05  # of the power of Q and N, that effects may leave; design choice
-#: K and B are tried up to this multiple of the scatter of neighbouring means. Design choice: far
-#: above, because too low a limit makes a bias of what is noise.
-_MAX_SCATTER = 3.0
 _SCORING_STEPS = 4  # of Fisher scoring, as in `gyrostab.diagnose.predict.condition`
 _MIN_CHANGE = 1e-6  # of the expected powers, from which effects change them; above rounding errors
 _LEVEL_GROUPS = 30  # of blocks of similar power, where effects change it; limits time
@@ -319,7 +316,7 @@ def _find_ranges(
     """
     span = means.size * block
     K, B = fine_grid(density, span, block)
-    scatter = _MAX_SCATTER * float(np.nanstd(np.diff(means[np.isfinite(means)])))
+    scatter = MAX_SCATTER * float(np.nanstd(np.diff(means[np.isfinite(means)])))
     sizes = np.sqrt(block * float(np.nanmedian(variance)) * _DENSITY_RATIOS / 2.0)
     ranges = [
         (K[0], max(K[-1], scatter * math.sqrt(HOUR / block))),

@@ -23,6 +23,7 @@ from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.scores import cube_root_score
 from gyrostab.errors import OptionError, SchemaError
+from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.spectra.expected import expected_powers, sample_covariance
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
 from gyrostab.noise import URAD_PER_S
@@ -426,6 +427,16 @@ def test_waves_faster_than_a_block_are_angle_noise_of_its_mean():
     assert np.nanstd(find_statistic("mean").score(nulls, baseline)["z"]) == pytest.approx(
         1.0, abs=0.1
     )
+
+
+def test_a_course_slower_than_a_block_is_no_angle_noise():
+    """Its scatter is far above white noise, and above all of K and B that this noise would hide."""
+    second = np.arange(3600) / 10.0
+    turned = [0, 300, 900, 500, 1200, 800, 1100, 950, 1190, 700, 1000, 400, 0]  # deg/h
+    rate = 0.5 * np.random.default_rng(1).standard_normal(second.size)
+    rate += np.interp(second, np.linspace(0.0, 320.0, len(turned)), turned)
+    blocks = reduce_log(make_log(rate, rate=10.0, unit="deg/h"))
+    assert not calibrate_noise(blocks)["angle_variance"].any()
 
 
 def test_null_means_have_the_noise_of_means_where_it_is_apart():
