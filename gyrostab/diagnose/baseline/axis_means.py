@@ -68,6 +68,8 @@ class AxisMeans(NamedTuple):
         if self.present.sum() < _MIN_MEANS:
             return self
         scatter = float(np.diff(self.values[self.present, 0]).var())
+        if scatter == 0.0:
+            return self
         most = MAX_SCATTER * np.sqrt(scatter) * np.array([np.sqrt(HOUR / self.step), 1.0])
         ends = np.log([[K.min(), max(K.max(), most[0])], [B.min(), max(B.max(), most[1])]])
         start = np.log([K[likelihood.argmax()], B[likelihood.argmax()]])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from gyrostab.diagnose.baseline.axis_means import AxisMeans
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.expected_statistics import (
     common_variance,
@@ -17,6 +18,7 @@ from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
 from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
 from gyrostab.diagnose.baseline.quiescent import find_quiescent_blocks
+from gyrostab.diagnose.evidence.wandering import no_processes
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
@@ -437,6 +439,16 @@ def test_a_course_slower_than_a_block_is_no_angle_noise():
     rate += np.interp(second, np.linspace(0.0, 320.0, len(turned)), turned)
     blocks = reduce_log(make_log(rate, rate=10.0, unit="deg/h"))
     assert not calibrate_noise(blocks)["angle_variance"].any()
+
+
+def test_equal_means_have_no_angle_noise():
+    """As where the samples of a record repeat in every block."""
+    n = 90
+    values, present = np.full((n, 1), 3.0), np.ones(n, np.bool_)
+    means = AxisMeans(values, None, np.ones(n), 20.0, present, no_processes(n))
+    K = B = np.array([0.01, 1.0])
+    with np.errstate(all="raise"):
+        assert means.with_angle_noise(K, B, means.log_likelihood(K, B), 3.0) is means
 
 
 def test_null_means_have_the_noise_of_means_where_it_is_apart():
