@@ -16,7 +16,6 @@ from gyrostab.allan.plan import Plan, last_sample, units_of_work
 from gyrostab.kernels.allan.gap_edges import gap_edge_ratio
 from gyrostab.kernels.allan.outlier_count import count_outliers
 from gyrostab.kernels.allan.surface import Cells, Unit, convert_to_native, surface_unit
-from gyrostab.kernels.allan.trend import window_trends
 from gyrostab.kernels.workspace import Workspace, Workspaces
 from gyrostab.store.lazy import find_source, keep_sources, read_into, read_slice
 from gyrostab.units import HOUR
@@ -78,15 +77,19 @@ def _compute_unit(
     x: NDArray[np.generic], unit: Unit, tables: NoiseTables, space: Workspace | None = None
 ) -> tuple[list[Floats], Floats]:
     """Compute one unit: the fields of the cells, see `Cells`, and plane fields (9, n_windows)."""
-    cells, means = surface_unit(x, unit, space)
-    # angles are in degree, so their slopes in degree per second
-    scale = HOUR if unit.angle else 1.0
-    if unit.angle:
-        cells.avar[:] *= scale**2
-    means[0] *= scale
-    cells.difference_trend[:] *= _trend_scale(unit)
+    cells, lines = surface_unit(x, unit, space)
+    per_hour = HOUR / unit.interval
+    if unit.angle:  # in degree, so that the slopes are in degree per second or sample
+        cells.avar[:] *= HOUR**2
+        lines[0] *= per_hour
+    for trend in (cells.difference_trend, lines[2]):
+        trend *= per_hour ** (2 if unit.angle else 1)
+    first = np.arange(lines.shape[1]) * unit.step
+    native = convert_to_native(x)
+    outliers = count_outliers(native, first, unit.window)
+    edges = gap_edge_ratio(native, first, unit.window)
     fields = [*cells, estimate_freedoms(cells, tables)]
-    return fields, np.concatenate([means, _describe_windows(x, unit)])
+    return fields, np.vstack([lines, outliers, edges])
 
 
 def _compute_in_thread(
@@ -137,22 +140,6 @@ def _join_field(parts: list[Floats], sizes: list[int], n_axes: int, kind: Any) -
         rows = zip(parts, sizes, strict=True)
         parts = [np.concatenate([np.broadcast_to(part, (n, shape[2])) for part, n in rows])]
     return parts[0].reshape(shape)
-
-
-def _describe_windows(x: NDArray[np.generic], unit: Unit) -> NDArray[np.float64]:
-    """Compute the plane fields from the trend on, (7, n_windows)."""
-    x = convert_to_native(x)
-    count = (x.size - unit.window - unit.angle) // unit.step + 1
-    first = np.arange(count) * unit.step
-    trends = window_trends(x, angle=unit.angle, window=unit.window, step=unit.step, n_windows=count)
-    trends[0] *= _trend_scale(unit)
-    outliers = count_outliers(x, first, unit.window)
-    return np.vstack([trends, outliers, gap_edge_ratio(x, first, unit.window)])
-
-
-def _trend_scale(unit: Unit) -> float:
-    """Slope per sample (for angles: of the angle per sample) to deg/h^2."""
-    return float((HOUR / unit.interval) ** (2 if unit.angle else 1))
 
 
 def run_units(plan: Plan) -> tuple[Any, Any]:

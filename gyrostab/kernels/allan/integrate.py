@@ -1,8 +1,4 @@
-"""From samples to the angle: runs of present samples, sums per block, the integral.
-
-Missing samples never enter an inner loop: only if a sum is not finite are its samples checked one
-by one. After that, all work is on runs of present samples.
-"""
+"""From samples to the angle: runs of present samples, and the integral over them."""
 
 from __future__ import annotations
 
@@ -13,70 +9,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gyrostab.kernels.allan.plain_sums import LANES, MAX_LAGS
-from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
+from gyrostab.kernels.compiled import INNER, KERNEL
 
 #: Samples that are integrated and measured while they are in the cache.
 TILE = 4096
-# Samples that are looked at one by one where some of them are missing.
-_LOOK = 512
 # Samples that are seen together to be all present or all missing.
 _STRIP = 64
-# Samples in which the first present one is looked for at once.
-_SEARCH = 4096
 # Largest angle, relative to the median change between samples, for which one double suffices: cells
 # are then wrong by 2e-11 at most, and a bias that drifts by ten times the noise within a unit of
 # work does not need two doubles.
 _PLAIN = 1e7
-
-
-def first_present(x: NDArray[np.generic]) -> float:
-    """Find the first finite value of `x` as double; NaN without any."""
-    for a in range(0, x.size, _SEARCH):
-        finite = np.flatnonzero(np.isfinite(x[a : a + _SEARCH]))
-        if finite.size:
-            return float(x[a + finite[0]])
-    return np.nan
-
-
-@njit(fastmath=REORDER, **INNER)
-def _sum_samples(x, base):  # type: ignore[no-untyped-def]
-    total = 0.0
-    for i in range(x.size):
-        total += x[i] - base
-    return total
-
-
-@njit(**INNER)
-def _sum_present(x, base):  # type: ignore[no-untyped-def]
-    """Sum ``x - base`` over finite samples, and count them."""
-    total = 0.0
-    count = 0
-    for a in range(0, x.size, _LOOK):
-        part = x[a : a + _LOOK]
-        part_sum = _sum_samples(part, base)
-        if np.isfinite(part_sum):
-            total += part_sum
-            count += part.size
-            continue
-        for i in range(part.size):
-            if np.isfinite(part[i]):
-                total += part[i] - base
-                count += 1
-    return total, count
-
-
-@njit(**KERNEL)
-def block_sums(x, base, window, step, n_windows):  # type: ignore[no-untyped-def]
-    """Sum ``x - base`` over present samples, and count them, for heads and tails (n_blocks, 2)."""
-    whole_blocks = window // step
-    head = window - whole_blocks * step
-    heads, tails = np.zeros((n_windows + whole_blocks, 2)), np.zeros((n_windows + whole_blocks, 2))
-    for block in range(n_windows + whole_blocks):
-        a = block * step
-        heads[block, 0], heads[block, 1] = _sum_present(x[a : a + head], base)
-        if block < n_windows + whole_blocks - 1:
-            tails[block, 0], tails[block, 1] = _sum_present(x[a + head : a + step], base)
-    return heads, tails
 
 
 @njit(**INNER)

@@ -23,8 +23,6 @@ from gyrostab.kernels.allan.clusters import (
 )
 from gyrostab.kernels.allan.integrate import (
     align_two,
-    block_sums,
-    first_present,
     integrate,
     integrate_two,
     needs_two_doubles,
@@ -34,7 +32,7 @@ from gyrostab.kernels.allan.integrate import (
 )
 from gyrostab.kernels.allan.intervals import single_blocks
 from gyrostab.kernels.allan.pairs import strict_gap_factors
-from gyrostab.kernels.allan.trend import difference_slopes
+from gyrostab.kernels.allan.trend import difference_slopes, window_lines
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.workspace import Workspace
 
@@ -227,16 +225,19 @@ def surface_unit(
     cells : Cells
         The variance is in the square of the rate's unit (for angles: of angle per second). Without
         gaps only the variance differs between the windows.
-    means : ndarray (2, n_windows)
-        Mean rate [unit of the rate; for angles: of angle per second], NaN without a sample; share
-        of samples present.
+    lines : ndarray (7, n_windows)
+        Result of `window_lines`.
     """
     counts_only = np.issubdtype(x.dtype, np.integer)
-    x, space = convert_to_native(x), space or Workspace()
-    n_windows = _number_of_windows(x, unit)
-    if np.isnan(first_present(x)):
-        return _empty_cells(n_windows, unit.ks.size)
-    means, mean, gaps = _average_windows(x, unit, n_windows)
+    n_windows = (x.size - unit.window - unit.angle) // unit.step + 1
+    x = convert_to_native(x[: (n_windows - 1) * unit.step + unit.window + unit.angle])
+    space = space or Workspace()
+    lines, mean = window_lines(
+        x, angle=unit.angle, window=unit.window, step=unit.step, n_windows=n_windows
+    )
+    gaps = bool((lines[1] < 1.0).any())
+    if not lines[1].any():
+        return _empty_cells(n_windows, unit.ks.size), lines
     starts, stops = present_runs(x) if gaps else (np.zeros(1, np.int64), np.full(1, x.size))
     # integers less an integer: every sum is exact
     offset = float(np.rint(mean)) if counts_only else mean
@@ -246,18 +247,17 @@ def surface_unit(
     scale = VARIANCES[unit.variance].divisors(unit.ks) * (unit.interval if unit.angle else 1.0) ** 2
     if gaps:
         full = np.ascontiguousarray(np.broadcast_to(full, counts.shape))
-        return _cells_with_gaps(work, sums / scale, counts, full), means
+        return _cells_with_gaps(work, sums / scale, counts, full), lines
     ones = np.ones((1, unit.ks.size))
     other_fields = ones, STRICT * ones, ones, ones, ones, np.nan * ones
-    return Cells(sums / (scale * full), full, ones, *other_fields), means
+    return Cells(sums / (scale * full), full, ones, *other_fields), lines
 
 
-def _empty_cells(n_windows: int, n_tau: int) -> tuple[Cells, Floats]:
-    """Cells and means of windows without any sample."""
+def _empty_cells(n_windows: int, n_tau: int) -> Cells:
+    """Cells of windows without any sample."""
     none, zero = np.full((1, n_tau), np.nan), np.zeros((1, n_tau))
     avar = np.full((n_windows, n_tau), np.nan)
-    means = np.stack([np.full(n_windows, np.nan), np.zeros(n_windows)])
-    return Cells(avar, zero, zero, zero, NONE + zero, none, none, none, none), means
+    return Cells(avar, zero, zero, zero, NONE + zero, none, none, none, none)
 
 
 def _cells_with_gaps(work: _Work, sums: Floats, counts: Floats, full: Floats) -> Cells:
@@ -317,38 +317,3 @@ def _find_slopes(work: _Work, with_gaps: NDArray[np.bool_]) -> Floats:
     places = starts, stops, unit.window, unit.step, n_windows
     slopes = difference_slopes(angle, *places, unit.ks, unit.points)
     return np.where(with_gaps, slopes, np.nan)
-
-
-def _number_of_windows(x: NDArray[np.generic], unit: Unit) -> int:
-    return int((x.size - unit.window - (1 if unit.angle else 0)) // unit.step + 1)
-
-
-def _average_windows(
-    x: NDArray[np.generic], unit: Unit, n_windows: int
-) -> tuple[Floats, float, bool]:
-    """Average the windows: means and coverage, overall mean, and whether a sample is missing."""
-    if unit.angle:
-        return _angle_means(x, unit, n_windows), np.nan, not np.isfinite(x).all()
-    base = first_present(x)
-    # less the first sample: small on a tool that turns
-    heads, tails = block_sums(x, base, unit.window, unit.step, n_windows)
-    total, present = heads.sum(axis=0) + tails.sum(axis=0)
-    windows = np.empty((n_windows, 2))
-    windows_from_blocks(heads, tails, np.full(2, unit.window // unit.step), windows)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        means = np.stack([base + windows[:, 0] / windows[:, 1], windows[:, 1] / unit.window])
-        return means, base + total / present, present < x.size
-
-
-def _angle_means(x: NDArray[np.generic], unit: Unit, n_windows: int) -> Floats:
-    """Slope between the first and last angle present in each window, and the share present."""
-    out = np.full((2, n_windows), np.nan)
-    for j in range(n_windows):
-        part = np.asarray(x[j * unit.step : j * unit.step + unit.window + 1], dtype=np.float64)
-        where = np.flatnonzero(np.isfinite(part))
-        out[1, j] = where.size / part.size
-        if where.size > 1:
-            out[0, j] = (part[where[-1]] - part[where[0]]) / (
-                (where[-1] - where[0]) * unit.interval
-            )
-    return out

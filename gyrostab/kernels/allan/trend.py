@@ -1,4 +1,4 @@
-"""Trend of the rate in each window: of its samples, and as its second differences see it."""
+"""Mean and trend of the rate in each window, and the trend as its second differences see it."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ def _block_moments(x, angle, base, window, step, n_windows):  # type: ignore[no-
     return heads, tails
 
 
-def window_trends(
+def window_lines(
     x: NDArray[Any], *, angle: bool, window: int, step: int, n_windows: int
-) -> NDArray[np.float64]:
+) -> tuple[NDArray[np.float64], float]:
     """Fit a straight line to the rates of each window.
 
     The rate over a gap of angles is the difference of those on both sides, with the weight of all
@@ -70,19 +70,24 @@ def window_trends(
 
     Returns
     -------
-    ndarray (5, n_windows)
-        Slope per sample [unit of the rate; for angles: of the angle per sample]; variance of that
-        slope under Q, N, B and K, relative to a window without gaps. NaN where fewer than two
-        rates are present.
+    lines : ndarray (7, n_windows)
+        Mean rate [unit of the rate; for angles: of the angle per sample], NaN without a rate; share
+        of samples present; slope per sample, and its variance under Q, N, B and K relative to a
+        window without gaps, NaN where fewer than two rates are present.
+    mean : float
+        Mean rate of all blocks.
     """
     finite = np.isfinite(x)
     present = finite[1:] & finite[:-1] if angle else finite
-    if np.count_nonzero(finite) < 2:
-        return np.full((5, n_windows), np.nan)
     first, starts = int(np.argmax(present)), np.arange(n_windows) * step
-    held = None
+    held, lines = None, np.full((7, n_windows), np.nan)
     if angle and not finite.all():
-        held = _HeldAngles(np.flatnonzero(finite), starts, window)
+        places = np.flatnonzero(finite)
+        shares = np.diff(np.searchsorted(places, [starts, starts + window + 1]), axis=0)
+        lines[1] = shares[0] / (window + 1)
+        if places.size < 2:
+            return lines, np.nan
+        held = _HeldAngles(places, starts, window)
         x = np.interp(np.arange(x.size), held.places, x[held.places], left=np.nan, right=np.nan)
         first = first if present[first] else int(held.places[0])
     base = float(x[first + 1]) - float(x[first]) if angle else float(x[first])
@@ -93,12 +98,17 @@ def window_trends(
         held.remove_partial(moments, x, base)
     count, place, square, rate, product = moments.T
     rates = count if held is None else held.last - held.first
+    if held is None:
+        lines[1] = count / window
+    total = (heads + tails).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
+        mean = base + total[3] / total[0]
+        lines[0] = base + rate / count
         spread = np.where(rates > 1, square - place**2 / count, np.nan)
-        slope = (product - place * rate / count) / spread
+        lines[2] = (product - place * rate / count) / spread
         white = window * (window**2 - 1.0) / 12.0 / spread
-        out = np.stack([slope, *np.ones((4, n_windows))])
-        out[2] = white
+        lines[3:] = 1.0
+        lines[4] = white
         lossy = np.flatnonzero(rates < window)
         if lossy.size:
             starts, centre = starts[lossy], place[lossy] / count[lossy]
@@ -109,8 +119,8 @@ def window_trends(
                 edges, parts = held.edge_squares(lossy, centre), held.count_parts(lossy)
             edges /= 0.5 * (window**2 - 1.0)
             slow = _slow_responses(*parts, window)
-            out[1:, lossy] = white[lossy] ** 2 * [edges, 1.0 / white[lossy], *slow]
-    return out
+            lines[3:, lossy] = white[lossy] ** 2 * [edges, 1.0 / white[lossy], *slow]
+    return lines, float(mean)
 
 
 class _HeldAngles:
@@ -296,7 +306,7 @@ def difference_slopes(theta, starts, stops, window, step, n_windows, ks, points)
     Returns
     -------
     float64 (n_windows, n_tau)
-        Slope per sample as of `window_trends`; NaN without second differences.
+        Slope per sample as of `window_lines`; NaN without second differences.
     """
     out = np.empty((n_windows, ks.size))
     sums = np.zeros(theta.size + 1)

@@ -83,9 +83,9 @@ class TestKernels:
         ]:
             ks = np.arange(1, n_tau + 1) * apart
             unit = Unit(1000, 300, ks, angle, 0.01, 0.3, 0.1)
-            for fresh, used in zip(
-                surface_unit(x, unit), surface_unit(x, unit, space), strict=True
-            ):
+            cells, lines = surface_unit(x, unit)
+            used_cells, used_lines = surface_unit(x, unit, space)
+            for fresh, used in zip([*cells, lines], [*used_cells, used_lines], strict=True):
                 np.testing.assert_array_equal(fresh, used)
 
     def test_blocks_use_the_plain_loop_where_the_vectors_cannot_be_imported(self):

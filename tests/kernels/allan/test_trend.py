@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gyrostab.kernels.allan.trend import window_trends
+from gyrostab.kernels.allan.trend import window_lines
 
 WINDOW, STEP, WINDOWS = 400, 150, 4
 SIZE = WINDOW + STEP * (WINDOWS - 1)
@@ -56,7 +56,8 @@ def test_trend_through_gaps_and_its_variance_are_the_sums_over_all_rates(name, k
     x = 3.0 + np.random.default_rng(2).standard_normal(SIZE)
     x = np.where(masks()[name], x if kind == "rate" else np.cumsum(x), np.nan)
     x = np.append(x, 7.0) if kind == "angle" else x
-    got = window_trends(x, angle=kind == "angle", window=WINDOW, step=STEP, n_windows=WINDOWS)
+    lines, _ = window_lines(x, angle=kind == "angle", window=WINDOW, step=STEP, n_windows=WINDOWS)
+    got = lines[2:]
     spreads = rate_covariances(WINDOW)
     whole = slope_weights(np.arange(WINDOW))
     for j in range(WINDOWS):
@@ -76,12 +77,16 @@ def test_trend_through_gaps_and_its_variance_are_the_sums_over_all_rates(name, k
 def test_trend_of_a_window_without_gaps_has_the_variance_of_the_tables():
     x = np.random.default_rng(3).standard_normal(SIZE)
     x[WINDOW + 1] = np.nan
-    got = window_trends(x, angle=False, window=WINDOW, step=STEP, n_windows=WINDOWS)
+    options = {"angle": False, "window": WINDOW, "step": STEP, "n_windows": WINDOWS}
+    got = window_lines(x, **options)[0][2:]
     assert (got[[1, 3, 4], 0] == 1.0).all()
     assert (got[1:, 1] != 1.0).all()
-    nothing = window_trends(x * np.nan, angle=False, window=WINDOW, step=STEP, n_windows=WINDOWS)
-    assert np.isnan(nothing).all()
+    nothing, mean = window_lines(x * np.nan, **options)
+    assert np.isnan([mean, *nothing[0], *nothing[2:].ravel()]).all()
+    assert (nothing[1] == 0.0).all()
     one = np.full(SIZE, np.nan)
     one[3] = 1.0
-    alone = window_trends(one, angle=False, window=WINDOW, step=STEP, n_windows=WINDOWS)
-    assert np.isnan(alone).all()
+    alone, mean = window_lines(one, **options)
+    assert mean == alone[0, 0] == 1.0
+    assert alone[1, 0] == 1.0 / WINDOW
+    assert np.isnan(alone[2:]).all()
