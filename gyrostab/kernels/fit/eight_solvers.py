@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from gyrostab.kernels.compiled import INNER
-from gyrostab.kernels.fit.lanes import PLACES, put, root, take, take_four, where_above
+from gyrostab.kernels.fit.lanes import put, root, take, take_four, where_above
 
 #: Terms at most, of which a problem has a set.
 _TERMS = 5
@@ -141,47 +141,8 @@ def solve_terms(scaled, right, terms, solution, work):  # type: ignore[no-untype
 
 
 @njit(**INNER)
-def _is_optimal(scaled, right, allowed, terms, solution, ok):  # type: ignore[no-untyped-def]
-    """Check the solution for `terms` by the Karush-Kuhn-Tucker conditions: `ok`, else zero."""
-    members = ok * 0.0
-    for i in range(_TERMS):
-        member, slope = take(terms, i), take(right, i)
-        for j in range(_TERMS):
-            slope = slope - take(scaled, 5 * i + j) * take(solution, j)
-        inside = where_above(take(solution, i), 0.0, ok, 0.0)
-        outside = where_above(slope, 0.0, 0.0, ok) if allowed >> i & 1 else ok
-        ok = where_above(member, 0.5, inside, outside)
-        members = members + member
-    return where_above(members, 0.5, ok, 0.0)
-
-
-@njit(**INNER)
-def _try_all(scaled, right, allowed, done, terms, solution, trial, tried, work):  # type: ignore[no-untyped-def]
-    """Terms and solution of the best of all subsets, in the places where `done` is zero."""
-    best = done * 0.0
-    for i in range(_TERMS):
-        put(terms, i, where_above(done, 0.5, take(terms, i), 0.0))
-        put(solution, i, where_above(done, 0.5, take(solution, i), 0.0))
-    for subset in range(1, 1 << _TERMS):
-        if subset & ~allowed:
-            continue
-        for i in range(_TERMS):
-            put(tried, i, 1.0 if subset >> i & 1 else 0.0)
-        feasible = solve_terms(scaled, right, tried, trial, work)
-        gain = best * 0.0
-        for i in range(_TERMS):
-            feasible = where_above(0.0, take(trial, i), 0.0, feasible)
-            gain = gain + take(trial, i) * take(right, i)
-        gain = where_above(feasible, 0.5, where_above(done, 0.5, 0.0, gain), 0.0)
-        for i in range(_TERMS):
-            put(terms, i, where_above(gain, best, take(tried, i), take(terms, i)))
-            put(solution, i, where_above(gain, best, take(trial, i), take(solution, i)))
-        best = where_above(gain, best, gain, best)
-
-
-@njit(**INNER)
 def solve_nonnegative_eights(normal, right, allowed, terms, squares, room):  # type: ignore[no-untyped-def]
-    """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0`` in each place.
+    """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0`` in each place, by all subsets.
 
     Parameters
     ----------
@@ -190,7 +151,6 @@ def solve_nonnegative_eights(normal, right, allowed, terms, squares, room):  # t
     allowed : int
         Bit set of the terms that may be used, in every place.
     terms : eights (5,)
-        Sets of terms that are tried first; where one holds the minimiser, no other is tried.
         Overwritten with the terms above zero.
     squares : eights (5,)
         Overwritten with the minimiser.
@@ -200,15 +160,25 @@ def solve_nonnegative_eights(normal, right, allowed, terms, squares, room):  # t
     scaled, work, scale, scaled_right = room[:25], room[25:50], room[50:55], room[55:60]
     solution, trial, tried = room[60:65], room[65:70], room[70:75]
     scale_equations(normal, scale, scaled)
+    best = take(scale, 0) * 0.0
     for i in range(_TERMS):
         put(scaled_right, i, take(right, i) * take(scale, i))
-    solvable = solve_terms(scaled, scaled_right, terms, solution, work)
-    done = _is_optimal(scaled, scaled_right, allowed, terms, solution, solvable)
-    put(tried, 0, done)
-    everywhere = True
-    for place in range(PLACES):
-        everywhere = everywhere and tried[0, place] > 0.5
-    if not everywhere:
-        _try_all(scaled, scaled_right, allowed, done, terms, solution, trial, tried, work)
+        put(terms, i, 0.0)
+        put(solution, i, 0.0)
+    for subset in range(1, 1 << _TERMS):
+        if subset & ~allowed:
+            continue
+        for i in range(_TERMS):
+            put(tried, i, 1.0 if subset >> i & 1 else 0.0)
+        feasible = solve_terms(scaled, scaled_right, tried, trial, work)
+        gain = best * 0.0
+        for i in range(_TERMS):
+            feasible = where_above(0.0, take(trial, i), 0.0, feasible)
+            gain = gain + take(trial, i) * take(scaled_right, i)
+        gain = where_above(feasible, 0.5, gain, 0.0)
+        for i in range(_TERMS):
+            put(terms, i, where_above(gain, best, take(tried, i), take(terms, i)))
+            put(solution, i, where_above(gain, best, take(trial, i), take(solution, i)))
+        best = where_above(gain, best, gain, best)
     for i in range(_TERMS):
         put(squares, i, take(solution, i) * take(scale, i))

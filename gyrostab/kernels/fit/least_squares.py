@@ -99,7 +99,6 @@ def _fit_diagonal(cells, weight, allowed, fit):  # type: ignore[no-untyped-def]
         put(normal, row, 0.0)
     for a in range(5):
         put(right, a, 0.0)
-        put(terms, a, 0.0)
     level = take(inverse, 0) * 0.0
     for i in range(weight.size):
         y, first = take(cells.avar, i), take(system, WIDTH * i)
@@ -242,7 +241,6 @@ def _refit_windows(allowed, cells, fit, units, augmented, tables):  # type: igno
         moves = take(state, 0)
         for a in range(5):
             put(basis, a, where_above(moves, 0.5, take(squares, a), take(basis, a)))
-            put(tried, a, take(terms, a))
         _find_ramp(cells.trend, basis)
         _factor_covariance(cells, basis, state, units, roots, augmented, tables)
         _normal_equations(augmented, n, normal, right)
