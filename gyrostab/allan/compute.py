@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from gyrostab.allan.freedoms import NoiseTables, estimate_freedoms, make_noise_tables
 from gyrostab.allan.plan import Plan, last_sample, units_of_work
-from gyrostab.kernels.allan.gap_edges import gap_edge_ratio
-from gyrostab.kernels.allan.outlier_count import count_outliers
+from gyrostab.kernels.allan.biased_samples import count_outliers, gap_edge_ratio
 from gyrostab.kernels.allan.surface import Cells, Unit, convert_to_native, surface_unit
 from gyrostab.kernels.workspace import Workspace, Workspaces
 from gyrostab.store.lazy import find_source, keep_sources, read_into, read_slice

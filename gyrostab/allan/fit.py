@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gyrostab.allan.band_limit import BandLimit, choose_windows, filter_response, find_band_limit
 from gyrostab.allan.fit_inputs import FIT_VARIABLES, check_options, prepare_fit, term_bits
 from gyrostab.allan.window_fit import fit_block
-from gyrostab.kernels.fit.autocovariance import STOCHASTIC
+from gyrostab.kernels.fit.covariance import STOCHASTIC
 from gyrostab.noise import TERMS
 from gyrostab.schema import attributes
 

@@ -13,7 +13,7 @@ from gyrostab.allan.compute import TREND_RESPONSES
 from gyrostab.allan.freedoms import thin_factors
 from gyrostab.allan.window_fit import FitTables, fit_tables
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.kernels.fit.autocovariance import STOCHASTIC
+from gyrostab.kernels.fit.covariance import STOCHASTIC
 from gyrostab.noise import TERMS
 from gyrostab.schema import check_surface
 from gyrostab.time.durations import duration_seconds

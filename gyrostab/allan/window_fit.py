@@ -13,9 +13,8 @@ from gyrostab.allan.variance import variance_columns, white_freedoms
 from gyrostab.kernels.allan.clusters import cluster_strides
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compile_ahead import await_compilation
-from gyrostab.kernels.fit.autocovariance import STOCHASTIC
 from gyrostab.kernels.fit.averages import FIT_FIELDS
-from gyrostab.kernels.fit.covariance import product_tables
+from gyrostab.kernels.fit.covariance import STOCHASTIC, product_tables
 from gyrostab.kernels.fit.freedoms import combine_diagonal
 from gyrostab.kernels.fit.least_squares import fit_windows
 from gyrostab.kernels.fit.limits import cell_limits, estimate_bounds

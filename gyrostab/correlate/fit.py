@@ -12,6 +12,7 @@ from gyrostab.correlate.drivers import Driver
 from gyrostab.correlate.judge import driver_limits
 from gyrostab.kernels.regression.coupling import (
     Laws,
+    average_windows,
     calibrated,
     decompose,
     fit_lags,
@@ -24,7 +25,6 @@ from gyrostab.kernels.regression.coupling import (
     uncalibrated,
     weights,
 )
-from gyrostab.kernels.regression.windows import average_windows
 
 Array = NDArray[np.float64]
 _MAX_BLOCKS = 160  # longer records are averaged further

@@ -24,7 +24,7 @@ from gyrostab.schema import (
     log_channels,
     signal_name,
 )
-from gyrostab.simulate.block import BlockState, Plan, Step
+from gyrostab.simulate.block import BlockState, Plan, Step, lazy_rates
 from gyrostab.simulate.channels import combine
 from gyrostab.simulate.drivers import Source, make_course, make_source
 from gyrostab.simulate.frame import (
@@ -36,7 +36,6 @@ from gyrostab.simulate.frame import (
     make_frame,
     take_environment,
 )
-from gyrostab.simulate.lazy import lazy_rates
 from gyrostab.simulate.model import Model, naming_of, read_model
 from gyrostab.simulate.noise import begin_noise, stream
 from gyrostab.time.clock import time_of_day

@@ -10,7 +10,7 @@ from gyrostab.allan.davar import davar
 from gyrostab.allan.fit import fit_noise
 from gyrostab.allan.summary import describe_record
 from gyrostab.ingest.make_log import make_log
-from gyrostab.kernels.allan.gap_edges import EDGE_SAMPLES, gap_edge_ratio
+from gyrostab.kernels.allan.biased_samples import EDGE_SAMPLES, gap_edge_ratio
 
 
 @pytest.mark.parametrize(("present", "estimator"), [(4, 0), (6, 2)])

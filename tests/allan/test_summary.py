@@ -15,7 +15,7 @@ from gyrostab.allan.summary import (
     summarise_terms,
 )
 from gyrostab.cli import main
-from gyrostab.kernels.allan.outlier_count import count_outliers
+from gyrostab.kernels.allan.biased_samples import count_outliers
 from tests.support import synthetic
 
 RATE = 100.0

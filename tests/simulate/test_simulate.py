@@ -25,8 +25,8 @@ from gyrostab.io.opening import open_log
 from gyrostab.physics.registry import effects
 from gyrostab.schema import check_log
 from gyrostab.simulate import drivers, lazy, read_model, simulate
+from gyrostab.simulate.block import Chain
 from gyrostab.simulate.environment import ramps
-from gyrostab.simulate.lazy import Chain
 from gyrostab.simulate.losses import gaps
 from gyrostab.time.grid import time_coordinate
 from tests.support.simulated import BIASED, LOG, WORLD, every_channel, model

@@ -31,8 +31,8 @@ from gyrostab.diagnose.predict.windows import complex_factors, predict_effect
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.physics.base import Effect
-from gyrostab.physics.logger_filter import LoggerFilter
 from gyrostab.physics.prediction import Prediction
+from gyrostab.physics.sampling import LoggerFilter
 from gyrostab.simulate.model import Model
 from gyrostab.units import HOUR
 

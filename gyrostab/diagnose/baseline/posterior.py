@@ -16,7 +16,7 @@ from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.regression.nonnegative import solve_nonnegative
-from gyrostab.physics.logger_filter import LoggerFilter
+from gyrostab.physics.sampling import LoggerFilter
 from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]

@@ -24,7 +24,7 @@ from gyrostab.diagnose.result.text import effect_statement, span_text, unsized_s
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.noise import LAWS
-from gyrostab.physics.logger_filter import FAST_INSTRUMENT_SAMPLES
+from gyrostab.physics.sampling import FAST_INSTRUMENT_SAMPLES
 from gyrostab.simulate.model import Model
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gyrostab.kernels.allan.blocks import windows_from_blocks
 from gyrostab.kernels.allan.intervals import valid_intervals
 from gyrostab.kernels.compiled import INNER, KERNEL
-from gyrostab.kernels.fit.autocovariance import angle_covariances
+from gyrostab.kernels.fit.covariance import angle_covariances
 
 #: Moments of a block: present samples, their places, squares of these, rates, rates times places.
 _MOMENTS = 5

@@ -2,15 +2,15 @@
 
 A second difference is ``d_k[m] = theta[m + 2k] - 2 theta[m + k] + theta[m]``; its covariances
 follow from the generalised autocovariance of the angle (Greenhall and Riley, PTTI 2003), in units
-of one sample and unit squared coefficient:
+of one sample and unit squared coefficient. The Hadamard variance has third differences of the
+angle, the modified Allan variance those of its running sum. The autocovariance G of the running sum
+follows from that of the angle, R = -(second difference of G):
 
-    quantization         delta(t)                  Allan variance 3 / k^2
-    angle random walk    -|t| / 2                                 1 / k
-    bias instability     t^2 ln|t| / (2 pi)                       2 ln 2 / pi
-    rate random walk     |t|^3 / 12                               k / 3
-
-The Hadamard variance has third differences of the angle, the modified Allan variance those of its
-running sum (`gyrostab.kernels.fit.autocovariance`).
+    term                 Allan variance   angle                running sum
+    quantization         3 / k^2          delta(t)             -|t| / 2
+    angle random walk    1 / k            -|t| / 2             (|t|^3 - |t|) / 12
+    bias instability     2 ln 2 / pi      t^2 ln|t| / (2 pi)   no closed form; summed
+    rate random walk     k / 3            |t|^3 / 12           -(|t|^5 - 5/3 |t|^3 + 2/3 |t|) / 240
 
 By Isserlis' theorem the covariance of two mean squares is twice the mean squared covariance of
 their terms. Because the terms add, a mixture of noises needs only the tables of products made here,
@@ -27,14 +27,49 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
-from gyrostab.kernels.fit.autocovariance import STOCHASTIC, autocovariances
 
+#: Number of stochastic terms: quantization, angle random walk, bias instability, rate random walk.
+STOCHASTIC = 4
 #: Lags are taken in steps of this share of the shorter factor.
 _LAG_STEPS = 32
 _FLICKER_FACTOR = 1.0 / (2.0 * math.pi)
 _THIRD_WEIGHTS = (-1.0, 3.0, -3.0, 1.0)
 #: Lag over k from which a third difference is taken as a derivative, which is then good to 1e-8.
 _FAR = 1e4
+
+
+def angle_covariances(term: int, lags: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Compute the generalised autocovariance of the angle under Q, N, B or K (0 to 3)."""
+    if term == 0:
+        return np.where(lags == 0, 1.0, 0.0)
+    if term == 1:
+        return -0.5 * lags
+    out = np.maximum(lags, 1.0) if term == 2 else lags * lags
+    if term == 2:
+        np.log(out, out=out)
+        out *= lags * lags
+        out /= 2.0 * math.pi
+    else:
+        out *= lags
+        out /= 12.0
+    return out
+
+
+def autocovariances(lags: int, *, summed: bool) -> NDArray[np.float64]:
+    """Compute the generalised autocovariances of Q, N, B and K, (4, lags)."""
+    t = np.arange(lags, dtype=np.float64)
+    out = np.empty((STOCHASTIC, lags))
+    if not summed:
+        for term, row in enumerate(out):
+            row[:] = angle_covariances(term, t)
+        return out
+    out[0] = -0.5 * t
+    out[1] = (t**3 - t) / 12.0
+    flicker = angle_covariances(2, t)
+    out[2, :2] = 0.0
+    out[2, 2:] = -np.cumsum(np.cumsum(flicker[1:-1]))
+    out[3] = -(t**5 - 5.0 / 3.0 * t**3 + 2.0 / 3.0 * t) / 240.0
+    return out
 
 
 @njit(**INNER)

@@ -4,7 +4,7 @@ The square b^2 of the least-squares slope of a window estimates R^2 plus the var
 under the other terms. ``z = avar - b^2 tau^2 / 2`` therefore has no part of a ramp; its mean per
 squared coefficient is that of the Allan variance less ``v tau^2 / 2``. All quantities are exact for
 windows without gaps, in units of one sample, from the autocovariances of
-`gyrostab.kernels.fit.autocovariance`.
+`gyrostab.kernels.fit.covariance`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.kernels.fit.autocovariance import STOCHASTIC, angle_covariances
+from gyrostab.kernels.fit.covariance import STOCHASTIC, angle_covariances
 
 #: Second differences are taken at steps of this share of k, and at this many places at least.
 _STEPS, _PLACES = 32, 2**16

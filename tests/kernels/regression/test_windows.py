@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gyrostab.kernels.regression.windows import (
+from gyrostab.kernels.regression.coupling import (
     average_windows,
     slow_covariance,
     white_covariance,
