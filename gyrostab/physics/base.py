@@ -119,7 +119,6 @@ class Setup:
 
     rate: float  # sampling rate at the effect's stage [Hz]
     size: int  # samples of the whole log at that rate
-    start: int  # stamp of sample 0 [ns since 1970]
     axes: tuple[str, ...]  # the effect's axes, in the order of the rows of every array
     #: (axes,): noise coefficients of the model by symbol [unit of the law]: Q, N, B, K, R.
     noise: Mapping[str, Array] = field(default_factory=dict)
@@ -251,16 +250,6 @@ class Effect:
         return cls(
             **{definition.name: definition.typical for definition in cls.parameters()} | values
         )
-
-    def switched_off(self) -> Self:
-        """Make the same effect with zero size."""
-        zero: dict[str, Any] = {
-            definition.name: (0.0,) * len(getattr(self, definition.name))
-            if definition.many
-            else 0.0
-            for definition in self.parameters()
-        }
-        return replace(self, **{name: zero[name] for name in self.size_parameters})
 
     def list_sizes(self) -> tuple[str, ...]:
         """List the size parameters that are not zero."""

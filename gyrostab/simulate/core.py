@@ -159,7 +159,6 @@ def _make_setup(
     return Setup(
         rate=frame.rate * factor,
         size=frame.size * factor,
-        start=frame.start,
         axes=axes,
         noise={term: np.array([coefficients[term] for coefficients in noise]) for term in TERMS},
         gaps=table[:, :2] * factor,

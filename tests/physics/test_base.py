@@ -14,7 +14,13 @@ from gyrostab.physics.base import STAGES, Effect, Prediction, Windows
 from gyrostab.physics.registry import effect_table, effects, make_effect
 from gyrostab.simulate import simulate
 from gyrostab.units import INNER
-from tests.support.effect_bench import build_effect, random_cuts, run, same_whatever_the_cuts
+from tests.support.effect_bench import (
+    build_effect,
+    random_cuts,
+    run,
+    same_whatever_the_cuts,
+    switch_off,
+)
 from tests.support.simulated import TYPICAL
 
 EFFECTS = list(effects().values())
@@ -70,7 +76,7 @@ def test_declares_itself(kind):
 def test_acts_at_its_typical_size(kind):
     given = options(kind)
     changed = run(kind.example(), **given)
-    plain = run(kind.example().switched_off(), **given)
+    plain = run(switch_off(kind.example()), **given)
     if isinstance(changed, dict):
         assert any(np.any(changed[symbol] != plain[symbol]) for symbol in changed)
     else:
@@ -80,7 +86,7 @@ def test_acts_at_its_typical_size(kind):
 @with_each_effect
 def test_zero_size_changes_nothing(kind):
     given = options(kind)
-    off = kind.example().switched_off()
+    off = switch_off(kind.example())
     done = run(off, **given)
     if kind.stage == "noise":
         for symbol, level in done.items():
@@ -310,7 +316,7 @@ def test_a_driver_may_name_the_needed_channels_alone():
         "supply_voltage": "supply_voltage",
         "light_power": "laser_power",
     }
-    assert effect.switched_off().channel_names()["light_power"] == "laser_power"
+    assert switch_off(effect).channel_names()["light_power"] == "laser_power"
 
 
 def test_units_are_converted():

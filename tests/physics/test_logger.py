@@ -109,7 +109,7 @@ def test_filter_has_the_predicted_responses(table, term):
 
 
 def test_impossible_filter_is_refused():
-    setup = Setup(rate=10.0, size=100, start=0, axes=("x",))
+    setup = Setup(rate=10.0, size=100, axes=("x",))
     rng = np.random.default_rng(1)
     with pytest.raises(
         OptionError,
@@ -325,7 +325,7 @@ def test_clock_error_keeps_white_noise():
 
 
 def test_large_clock_error_is_refused():
-    setup = Setup(rate=400.0, size=400 * 3600 * 200, start=0, axes=("x",))
+    setup = Setup(rate=400.0, size=400 * 3600 * 200, axes=("x",))
     rng = np.random.default_rng(1)
     with pytest.raises(OptionError, match="slip reaches 28800003 samples; make the log shorter"):
         build_effect("clock_error", error=1e5).begin(setup, rng)

@@ -14,7 +14,7 @@ from gyrostab.kernels.thermal import mean_changes
 from gyrostab.noise import LAWS
 from gyrostab.physics.base import Windows
 from gyrostab.physics.registry import effects, make_effect
-from tests.support.effect_bench import allan_of_samples, build_effect, run
+from tests.support.effect_bench import allan_of_samples, build_effect, run, switch_off
 
 RATE, LENGTH = 2.0, 7200
 _T = np.arange(int(LENGTH * RATE)) / RATE
@@ -125,7 +125,7 @@ def test_predicted_levels_are_the_generated_ones(name, parameter):
     size = {"linear": 0.01, "quadratic": 1e-4, "thermal": 0.4, "shot": 0.4, "growth": 0.7}[
         parameter
     ]
-    effect = effects()[name].example().switched_off()
+    effect = switch_off(effects()[name].example())
     effect = replace(effect, **{parameter: size})
     rows, windows = windows_of(effect)
     squares = generated(effect, N=0.1)["N"][0]

@@ -24,11 +24,12 @@ from gyrostab.io.datasets import to_netcdf
 from gyrostab.io.opening import open_log
 from gyrostab.physics.registry import effects
 from gyrostab.schema import check_log
-from gyrostab.simulate import drivers, lazy, read_model, simulate
+from gyrostab.simulate import block, drivers, read_model, simulate
 from gyrostab.simulate.block import Chain
 from gyrostab.simulate.environment import ramps
 from gyrostab.simulate.losses import gaps
 from gyrostab.time.grid import time_coordinate
+from tests.support.effect_bench import switch_off
 from tests.support.simulated import BIASED, LOG, WORLD, every_channel, model
 
 # --------------------------------------------------------------------------------
@@ -157,7 +158,7 @@ def test_zero_size_changes_nothing_whatever_the_effect():
     plain = read_model(model(environment=[WORLD[5], WORLD[6]], effect=[]))
     before = simulate(plain, environment=world, seed=3).rate.values
     for name, kind in effects().items():
-        off = replace(plain, effects=(kind.example().switched_off(),))
+        off = replace(plain, effects=(switch_off(kind.example()),))
         np.testing.assert_array_equal(
             simulate(off, environment=world, seed=3).rate.values, before, err_msg=name
         )
@@ -280,7 +281,7 @@ def test_chain_takes_each_step_once_and_resumes_from_a_state():
     chain = Chain(step, 1, 2000)
     whole = [chain(number) for number in range(2000)]
     assert steps_taken == list(range(2000))
-    assert len(chain._states) <= lazy.STATES + 3 * lazy.RECENT
+    assert len(chain._states) <= block.STATES + 3 * block.RECENT
     steps_taken.clear()
     assert chain(1001) == whole[1001]
     assert len(steps_taken) <= 4  # 2000 steps, 512 states
@@ -314,13 +315,13 @@ def test_a_copy_in_another_process_gives_the_same(monkeypatch):
 
 def test_writing_in_pieces_makes_each_block_once(tmp_path, monkeypatch):
     made: list[int] = []
-    step = lazy.next_block
+    step = block.next_block
 
     def counted(plan, state, first, count, units):
         made.append(first)
         return step(plan, state, first, count, units)
 
-    monkeypatch.setattr(lazy, "next_block", counted)
+    monkeypatch.setattr(block, "next_block", counted)
     log = simulate({"noise": {"N": 0.01}}, duration="1h", rate=100.0, chunk=6000)
     for first in range(0, 360_000, 90_000):
         log.rate.isel(time=slice(first, first + 90_000)).compute()

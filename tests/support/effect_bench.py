@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -20,6 +21,16 @@ from gyrostab.physics.registry import make_effect
 def build_effect(name: str, **parameters: Any) -> Effect:
     """Make an effect as from its table in a model."""
     return make_effect({"name": name, **parameters})
+
+
+def switch_off(effect: Effect) -> Effect:
+    """Make the same effect with zero size."""
+    many = {item.name for item in effect.parameters() if item.many}
+    zeros = {
+        name: (0.0,) * len(getattr(effect, name)) if name in many else 0.0
+        for name in effect.size_parameters
+    }
+    return replace(effect, **zeros)
 
 
 def run(
@@ -48,7 +59,7 @@ def run(
         symbol: np.broadcast_to(value, len(names)).astype(float)
         for symbol, value in (noise or {}).items()
     }
-    frame = Setup(rate=rate, size=size, start=0, axes=names, noise=coefficients, **setup)
+    frame = Setup(rate=rate, size=size, axes=names, noise=coefficients, **setup)
     state = effect.begin(frame, np.random.default_rng(seed))
     given = {
         name: np.broadcast_to(np.asarray(values, float), size)
