@@ -134,18 +134,14 @@ def refit(product: xr.Dataset, **options: Any) -> xr.Dataset:
         if attribute in product.attrs
     }
     if "fit_tau_min" in product and "tau_min" not in options:
-        stored_options["bands"] = _stored_bands(product)
+        stored = [product[name].values for name in _BAND_VARIABLES if name in product]
+        axes = map(str, product["axis"].values)
+        stored_options["bands"] = dict(zip(axes, zip(*stored, strict=True), strict=True))
     if "window_trend" not in product:  # of an earlier version: without the ramp
         none = xr.zeros_like(product["window_mean"])
         product = product.assign(window_trend=none, trend_response=none)
         stored_options["terms"] = str(stored_options.get("terms", "QNBK")).replace("R", "")
     return _fit_checked(product, **{**stored_options, "observed_only": False, **options})
-
-
-def _stored_bands(product: xr.Dataset) -> Bands:
-    stored = [product[name].values for name in _BAND_VARIABLES if name in product]
-    limits = zip(*stored, strict=True)
-    return dict(zip(map(str, product["axis"].values), limits, strict=True))
 
 
 def fit_part(surface: xr.Dataset, **options: Any) -> xr.Dataset:

@@ -83,19 +83,16 @@ def suggest_windows(span: float, white: float) -> list[str]:
         f"N is about {white:.2g} deg/sqrt(h). With that noise alone, half of the windows observe:"
     ]
     for window in lengths:
+        sizes = smallest_observable(window, white).items()
+        limits = ", ".join(f"{term} from {size:.2g} {LAWS[term].label}" for term, size in sizes)
+        count = int(span // window)
         lines.append(
-            f"  --window {format_duration(window)}: {_describe_limits(window, white)}"
-            f"; {int(span // window)} windows without overlap"
+            f"  --window {format_duration(window)}: {limits}; {count} windows without overlap"
         )
     short, long = (format_duration(window) for window in (lengths[0], lengths[-1]))
     step = format_duration(lengths[-1] / 10)
     text = f"Suggested for B, K and R: --window {long} --step {step}"
     return [*lines, text + f"; to follow changes of N: --window {short}" * (long != short)]
-
-
-def _describe_limits(window: float, white: float) -> str:
-    limits = smallest_observable(window, white)
-    return ", ".join(f"{term} from {size:.2g} {LAWS[term].label}" for term, size in limits.items())
 
 
 def judge_product(product: xr.Dataset) -> list[str]:

@@ -112,6 +112,18 @@ def relax(
     return total, (float(values[-1]), position)
 
 
+def lag_values(
+    values: Array, rate: float, time: float, carry: tuple[float, Array] | None = None
+) -> tuple[Array, tuple[float, Array]]:
+    """Apply a first-order lag [s] to samples at `rate` [Hz], linear between them.
+
+    `carry` is what the call for the samples before returned; without it, from equilibrium.
+    """
+    carry = carry or (float(values[0]), np.zeros(1))
+    speed, carry = relax(values, rate, np.array([time]), np.ones((1, 1)), carry)
+    return values - time * speed[0], carry
+
+
 @njit(**KERNEL)
 def _follow_values(at: Array, values: Array, time: float) -> Array:
     behind = 0.0

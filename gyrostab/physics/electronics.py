@@ -89,7 +89,14 @@ class SupplyBias(Effect):
         bias = np.zeros(chunk.size)
         if not chunk.size:
             return bias, state
-        lagged = {name: self._lag_channel(chunk, name, state) for name in self.needs()}
+        lagged = {name: chunk.drivers[name] for name in self.needs()}
+        if self.lag:
+            from gyrostab.kernels.thermal import lag_values
+
+            for name, values in lagged.items():
+                lagged[name], state[name] = lag_values(
+                    values, chunk.rate, self.lag, state.get(name)
+                )
         if self.voltage:
             bias += self.voltage * (lagged["supply_voltage"] - self.reference_voltage)
         if self.power:
@@ -97,17 +104,6 @@ class SupplyBias(Effect):
         if self.ripple:
             bias += self.ripple * sine_means(chunk, self.frequency)
         return bias, state
-
-    def _lag_channel(self, chunk: Chunk, name: str, state: dict[str, Any]) -> Array:
-        """Apply the lag to a channel (linear between samples) and update the state."""
-        from gyrostab.kernels.thermal import relax
-
-        values = chunk.drivers[name]
-        if not self.lag:
-            return values
-        carry = state.get(name, (float(values[0]), np.zeros(1)))
-        speed, state[name] = relax(values, chunk.rate, np.array([self.lag]), np.ones((1, 1)), carry)
-        return np.asarray(values - self.lag * speed[0])
 
     def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
         """List lags without ripple, and ripple frequencies without lag."""

@@ -60,15 +60,6 @@ def sine_means(chunk: Chunk, frequency: float, phase: Array | float = 0.0) -> Ar
     return turn_means(middle, np.full(1, cycles), phase - math.pi / 2.0)
 
 
-def turns_of_windows(windows: Windows, rotation: Array) -> tuple[Array, Array]:
-    """Compute the turns up to the middle of every window, and within it, from its mean rate."""
-    rate, centre = rotation / TURN, windows.centre
-    between = (rate[1:] + rate[:-1]) / 2.0 * np.diff(centre)
-    return np.cumsum(np.concatenate([rate[:1] * centre[:1], between])), rate * (
-        windows.end - windows.begin
-    )
-
-
 def turn_means_of_windows(
     windows: Windows, rotation: Array, phase: Array, *, order: float = 1.0
 ) -> Array:
@@ -87,8 +78,10 @@ def turn_means_of_windows(
     -------
     ndarray, shape (axis, window)
     """
-    middle, inside = turns_of_windows(windows, order * rotation)
-    means = turn_means(middle, inside, phase[:, None])
+    rate, centre = order * rotation / TURN, windows.centre
+    between = (rate[1:] + rate[:-1]) / 2.0 * np.diff(centre)
+    middle = np.cumsum(np.concatenate([rate[:1] * centre[:1], between]))
+    means = turn_means(middle, rate * (windows.end - windows.begin), phase[:, None])
     for row, axis in enumerate(windows.axes):
         known = windows.turn_means.get(axis, np.empty((0, 0)))
         if order in range(1, known.shape[1] + 1):

@@ -142,7 +142,10 @@ def simulate(
         chunk=chunk or max(1, BLOCK // frame.oversampling),
     )
     if like is not None:
-        data = _mark_missing(data, like[signal_name(like)].transpose("axis", "time").data)
+        import dask.array as da
+
+        recorded = da.asarray(like[signal_name(like)].transpose("axis", "time").data)
+        data = da.where(da.isnan(recorded).rechunk(data.chunks), np.nan, data)
     return _label_log(made, frame, environment, table, data)
 
 
@@ -292,13 +295,6 @@ def _begin_states(plan: Plan, seed: int) -> BlockState:
         counts[name] = counts.get(name, 0) + 1
         states.append(step.effect.begin(step.setup, stream(seed, "effect", name, counts[name])))
     return BlockState(states)
-
-
-def _mark_missing(data: Any, signal: Any) -> Any:
-    """The samples that are NaN in `signal` are lost here too."""
-    import dask.array as da
-
-    return da.where(da.isnan(da.asarray(signal)).rechunk(data.chunks), np.nan, data)
 
 
 def _label_log(

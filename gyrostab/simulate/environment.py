@@ -142,20 +142,6 @@ def vibration(
     )
 
 
-def _apply_lag(values: Array, lag: float, sensor_rate: float) -> Array:
-    """Apply a first-order lag [s] to `values` (linear between samples), from equilibrium."""
-    if lag <= 0.0:
-        return values
-    from scipy.signal import lfilter
-
-    a = 1.0 / (lag * sensor_rate)
-    keep = math.exp(-a)
-    new = 1.0 - -math.expm1(-a) / a  # weight of the new end of a straight piece
-    drive = new * values[1:] + (1.0 - keep - new) * values[:-1]
-    lagged, _ = lfilter([1.0], [1.0, -keep], drive, zi=[keep * values[0]])
-    return np.concatenate([values[:1], lagged])
-
-
 def chamber(
     *,
     duration: Any,
@@ -223,7 +209,11 @@ def _make_temperature(
     name: str, function: Any, seconds: float, start: Any, sensor_rate: float, lag: float
 ) -> xr.Dataset:
     size = max(1, math.ceil(seconds * sensor_rate - 1e-6))
-    felt = _apply_lag(function(np.arange(size) / sensor_rate), lag, sensor_rate)
+    felt = function(np.arange(size) / sensor_rate)
+    if lag > 0.0:
+        from gyrostab.kernels.thermal import lag_values
+
+        felt, _ = lag_values(felt, sensor_rate, lag)
 
     def values(t: Array) -> Array:
         return np.asarray(felt[np.rint(t * sensor_rate).astype(np.int64)])
