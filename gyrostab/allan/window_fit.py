@@ -104,16 +104,11 @@ def quantile_curve(level: float) -> tuple[float, float, NDArray[np.float64]]:
     Returns start, step and ``nu ln q`` for `chi_square_quantile`. A step of 0.02 in ln nu leaves a
     relative error of q below 1e-9.
     """
-    start, step = (
-        np.log(0.01 * np.log(level) / np.log(0.05)),
-        0.02,
-    )  # from here on the quantile is above zero
+    # from here on the quantile is above zero
+    start, step = np.log(0.01 * np.log(level) / np.log(0.05)), 0.02
     freedom = np.exp(start + step * np.arange(int(np.log(1e15) / step)))
-    return (
-        float(start),
-        step,
-        np.asarray(freedom * np.log(gammaincinv(freedom / 2.0, level) * 2.0 / freedom)),
-    )
+    curve = freedom * np.log(gammaincinv(freedom / 2.0, level) * 2.0 / freedom)
+    return float(start), step, np.asarray(curve)
 
 
 @lru_cache(maxsize=4)

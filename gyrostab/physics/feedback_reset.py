@@ -277,9 +277,8 @@ def _count_resets(edges: Array, samples: float) -> tuple[Array, Array]:
     resets = np.diff(whole_turns, axis=1)
     moved = np.abs(np.diff(edges, axis=1))
     forward = resets >= 0
-    last = np.where(
-        forward, edges[:, 1:] - whole_turns[:, 1:], whole_turns[:, 1:] + 1.0 - edges[:, 1:]
-    )  # turns since the last reset
+    ahead = edges[:, 1:] - whole_turns[:, 1:]
+    last = np.where(forward, ahead, 1.0 - ahead)  # turns since the last reset
     between = 1.0 / np.where(resets == 0, 1.0, moved) / samples
     many = -np.expm1(-np.abs(resets) * between) / -np.expm1(-between)
     return resets, np.sign(resets) * np.exp(-last * between) * many

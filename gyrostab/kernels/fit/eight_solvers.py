@@ -113,9 +113,8 @@ def solve_terms(scaled, right, terms, solution, work):  # type: ignore[no-untype
         Scratch.
     """
     ok = take(terms, 0) * 0.0 + 1.0
-    for i in range(
-        _TERMS
-    ):  # Cholesky factor, its diagonal inverted, and forward solution, row by row
+    # Cholesky factor, its diagonal inverted, and forward solution, row by row
+    for i in range(_TERMS):
         member = take(terms, i)
         # a term outside the set stands alone
         pivot = take(scaled, 6 * i) * (1.0 + 1e-12) * member + (1.0 - member)

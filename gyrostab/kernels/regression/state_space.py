@@ -190,11 +190,9 @@ def whiten(
                     state[j, c] *= decay[j]
             _advance_states(covariance, decay, drive)
             continue
-        F = (
-            variance[i]
-            + mean_variance
-            + _project_covariance(covariance, weight, 0 if has_level else 1, gain)
-        )  # of the innovation; the level counts once known
+        # of the innovation; the level counts once known
+        F = variance[i] + mean_variance
+        F += _project_covariance(covariance, weight, 0 if has_level else 1, gain)
         if not has_level:  # the level becomes what the mean says, with the error of all the rest
             has_level = True
             _advance_states(covariance, decay, drive)

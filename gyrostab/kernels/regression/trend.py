@@ -58,10 +58,8 @@ def window_trend(values, seconds, first, last):  # type: ignore[no-untyped-def]
             begin += 1
         if begin >= end:
             continue
-        origin, start = (
-            values[begin],
-            seconds[begin],
-        )  # near the mean, so that the sums lose no digits
+        # near the mean, so that the sums lose no digits
+        origin, start = values[begin], seconds[begin]
         window_values, window_seconds = values[begin:end], seconds[begin:end]
         count, total, elapsed = _sum_finite(window_values, window_seconds, origin, start)
         out[0, j] = mean = origin + total / count
