@@ -32,7 +32,6 @@ from gyrostab.store.system import lock_file
 _SCHEMA = "gyrostab.job/1"
 _REMOVES_OPEN_FILES = os.name != "nt"
 _JOB_FILE = re.compile(r"lock|job\.json|log\.zarr|log\.sha256|windows-\d{10}\.block")
-_STORE_CHECKSUM_FILE = "log.sha256"
 _MAX_DIFFERENCES = 4  # differences that a message lists
 
 
@@ -270,34 +269,11 @@ def begin_job(folder: Path, fingerprint: Mapping[str, Any], *, parts: int, overw
     write_text(folder / "job.json", json.dumps({**job, "sha256": _hash_json(job)}, indent=1))
 
 
-def write_store_checksum(folder: Path) -> None:
-    """Write the checksum of the stored log in a job folder."""
-    write_text(folder / _STORE_CHECKSUM_FILE, _hash_tree(folder / "log.zarr"))
-
-
-def remove_damage(folder: Path) -> None:
-    """Remove incomplete files of a killed run, and the stored log if its checksum is wrong."""
-    for name in filter(is_leftover, _list_names(folder)):
-        _remove_path(folder / name)
-    store, seal = folder / "log.zarr", folder / _STORE_CHECKSUM_FILE
-    try:
-        is_intact = seal.read_text(encoding="ascii") == _hash_tree(store)
-    except (OSError, ValueError):
-        is_intact = False
-    if not is_intact:
-        seal.unlink(missing_ok=True)
-        if store.exists():
-            _remove_path(store)
-
-
-def _hash_tree(folder: Path) -> str:
-    """Compute the SHA-256 of the names and contents of all files of a folder."""
-    total = hashlib.sha256()
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        with path.open("rb") as file:
-            content = hashlib.file_digest(file, "sha256").hexdigest()
-        total.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
-    return total.hexdigest()
+def remove_remains(folder: Path) -> None:
+    """Remove incomplete files of a killed run, and its stored log, which is written again."""
+    for name in _list_names(folder):
+        if is_leftover(name) or name == "log.zarr":
+            _remove_path(folder / name)
 
 
 def _remove_path(path: Path) -> None:
@@ -313,10 +289,8 @@ def count_finished_parts(folder: Path) -> int:
 
 
 def has_finished_work(folder: Path) -> bool:
-    """Whether a job folder holds finished work: finished parts, or a stored log."""
-    return (folder / "job.json").exists() and (
-        count_finished_parts(folder) > 0 or "log.zarr" in _list_names(folder)
-    )
+    """Whether a job folder holds finished parts of a run."""
+    return (folder / "job.json").exists() and count_finished_parts(folder) > 0
 
 
 def _list_names(folder: Path) -> list[str]:

@@ -36,9 +36,8 @@ from gyrostab.jobs.job import (
     lock_job,
     make_fingerprint,
     read_job,
-    remove_damage,
     remove_job,
-    write_store_checksum,
+    remove_remains,
 )
 from gyrostab.jobs.load import count_samples as count_samples
 from gyrostab.jobs.load import load_log as load_log
@@ -287,8 +286,7 @@ def _compute_missing(
     from gyrostab.allan.plan import choose_window
 
     reading, windows, fitting = (job.options[name] for name in ("reading", "windows", "fitting"))
-    store = job.folder / "log.zarr"
-    remove_damage(job.folder)
+    remove_remains(job.folder)
     remove_leftovers(job.target)
     if any(map(find_url, paths)):
         return_large_arrays()  # chunks arrive in new arrays, which no thread reuses
@@ -297,7 +295,7 @@ def _compute_missing(
     def show_file(number: int, count: int, path: Path) -> None:
         stage("reading", count, number - 1, "files")
 
-    log = load_log([store]) if store.exists() else load_log(paths, **reading, on_file=show_file)
+    log = load_log(paths, **reading, on_file=show_file)
     if "window" not in windows:
         windows = {**windows, "window": choose_window(log)}
         warnings.warn(f"the window is {windows['window']}; --window gives another", stacklevel=2)
@@ -329,11 +327,9 @@ def _compute_missing(
     if pool.remote and len(blocks) < len(parts):
         # every worker can open logs of gyrostab, which do not mix with others
         kinds = (read_attribute(path, "gyrostab_content") for path in job.files)
-        if not store.exists() and "log" not in kinds:
+        if "log" not in kinds:
             stage("storing", 0)
-            to_zarr(log, store, stamps=False)
-            write_store_checksum(job.folder)
-            log = load_log([store])
+            log = load_log([to_zarr(log, job.folder / "log.zarr", stamps=False)])
         copy = zlib.compress(pickle.dumps(log), level=1)  # holds names and places, not samples
         call = (_compute_part_of_copy, pool.share(copy), windows, fitting)
     advance(0)

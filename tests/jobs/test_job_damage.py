@@ -16,8 +16,7 @@ from gyrostab.jobs.job import (
     check_job_folder,
     make_fingerprint,
     read_job,
-    remove_damage,
-    write_store_checksum,
+    remove_remains,
 )
 
 
@@ -43,28 +42,13 @@ def test_a_flipped_bit_in_the_description_of_a_run_is_noticed(tmp_path):
     assert read_job(tmp_path) is None
 
 
-@pytest.mark.parametrize(
-    "damage", ["none", "flipped", "cut", "gone", "no checksum", "checksum damaged"]
-)
-def test_a_damaged_store_of_a_run_is_removed(tmp_path, damage):
-    store = to_zarr(make_log(np.arange(100.0)[None], rate=1.0, unit="deg/h"), tmp_path / "log.zarr")
-    if damage != "no checksum":
-        write_store_checksum(tmp_path)
-    chunk = store / "rate" / "0.0"
-    content = chunk.read_bytes()
-    if damage == "flipped":
-        chunk.write_bytes(flip(content, len(content) // 2, 3))
-    elif damage == "cut":
-        (store / ".zattrs").write_bytes((store / ".zattrs").read_bytes()[:-5])
-    elif damage == "gone":
-        chunk.unlink()
-    elif damage == "checksum damaged":
-        (tmp_path / "log.sha256").write_bytes(b"\xff")
-    (tmp_path / ".windows-0000000000.block.gyrostab-0123abcd.part").write_text("half")
-    remove_damage(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == (
-        {"log.zarr", "log.sha256"} if damage == "none" else set()
-    )
+def test_only_finished_parts_of_a_killed_run_are_kept(tmp_path):
+    to_zarr(make_log(np.arange(100.0)[None], rate=1.0, unit="deg/h"), tmp_path / "log.zarr")
+    names = {"job.json", "lock", "windows-0000000000.block"}
+    for name in (*names, ".windows-0000000007.block.gyrostab-0123abcd.part"):
+        (tmp_path / name).write_text("half")
+    remove_remains(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == names
 
 
 def test_what_a_run_leaves_is_known_at_every_stage(tmp_path):
