@@ -66,7 +66,7 @@ def make_dask(source: Source, chunks: Any) -> Any:
 
     Examples
     --------
-    >>> make_dask(InMemory(np.arange(10.0)), 4)[3:6].compute()
+    >>> make_dask(Converted(np.arange(10.0), np.asarray, float), 4)[3:6].compute()
     array([3., 4., 5.])
     """
     import dask.array as da
@@ -134,11 +134,6 @@ def keep_sources(array: Any, derived: Any) -> Any:
     )
 
 
-def can_read_directly(array: Any) -> bool:
-    """Whether `read_into` reads an array without dask."""
-    return isinstance(array, np.ndarray) or find_source(array) is not None
-
-
 def read_into(array: Any, row: int, begin: int, out: NDArray[Any]) -> None:
     """Read samples of one row of an array into `out`, in the calling thread.
 
@@ -164,7 +159,7 @@ def read_slice(array: Any, begin: int, end: int) -> NDArray[Any]:
 
     Examples
     --------
-    >>> read_slice(make_lazy(np.arange(10.0), 4), 3, 6)
+    >>> read_slice(np.arange(10.0), 3, 6)
     array([3., 4., 5.])
     """
     return read_box(array, (*(slice(None),) * (len(array.shape) - 1), slice(begin, end)))
@@ -185,21 +180,6 @@ def read_box(array: Any, box: Sequence[slice]) -> NDArray[Any]:
     return np.asarray(
         selection.compute(scheduler="synchronous") if hasattr(selection, "compute") else selection
     )
-
-
-class InMemory(Source):
-    """An array in memory; `dask.array.from_array` would copy all of it."""
-
-    def __init__(self, values: NDArray[Any]):
-        self.values, self.shape, self.dtype = values, values.shape, values.dtype
-
-    def __getitem__(self, box: Any) -> NDArray[Any]:
-        return np.asarray(self.values[box])
-
-
-def make_lazy(array: NDArray[Any], chunk: int) -> Any:
-    """Wrap an array in memory as a dask array without a copy, in chunks along time."""
-    return make_dask(InMemory(array), (*array.shape[:-1], chunk))
 
 
 class FileVariable(Source):
@@ -244,7 +224,8 @@ class _Joined(RowSource):
     """Columns one after the other."""
 
     def __init__(self, columns: Sequence[Any]):
-        self.parts, self.dtype = tuple(columns), columns[0].dtype
+        self.parts = tuple(columns)
+        self.dtype = np.result_type(*(column.dtype for column in columns))
         self.edges = np.cumsum([0, *(column.shape[-1] for column in columns)]).tolist()
         self.shape = (self.edges[-1],)
 
@@ -261,17 +242,10 @@ def concatenate_columns(columns: Sequence[Any], chunk: int) -> Any:
     """Concatenate columns; the result is a dask array if one of them is."""
     if all(isinstance(column, np.ndarray) for column in columns):
         return np.concatenate(columns)
-    kinds = {column.dtype for column in columns}
-    if len(kinds) == 1 and all(map(can_read_directly, columns)):
-        return make_dask(_Joined(columns), chunk)
-    import dask.array as da
-
-    return da.concatenate(
-        [make_lazy(c, chunk) if isinstance(c, np.ndarray) else c for c in columns]
-    )
+    return make_dask(_Joined(columns), chunk)
 
 
-class Stacked(RowSource):
+class _Stacked(RowSource):
     """Arrays of one dimension as the rows of one array."""
 
     def __init__(self, rows: Sequence[Any]):
@@ -288,11 +262,7 @@ def stack_rows(rows: Sequence[Any]) -> Any:
     lazy_rows = [row for row in rows if not isinstance(row, np.ndarray)]
     if not lazy_rows:
         return np.stack(rows)
-    if all(map(can_read_directly, rows)):
-        return make_dask(Stacked(rows), (1, lazy_rows[0].chunks[0]))
-    import dask.array as da
-
-    return da.stack(rows)
+    return make_dask(_Stacked(rows), (1, lazy_rows[0].chunks[0]))
 
 
 class _Selected(RowSource):

@@ -21,9 +21,9 @@ from gyrostab.kernels.allan.blocks import held_points
 from gyrostab.kernels.allan.surface import Unit, surface_unit
 from gyrostab.kernels.workspace import Workspace, Workspaces
 from gyrostab.schema import ESTIMATORS
-from gyrostab.store.lazy import make_lazy
 from tests.reference import direct_angle_surface, direct_surface
 from tests.support.published import published_davar
+from tests.support.stored import make_lazy
 
 STRICT, WEIGHTED = ESTIMATORS.index("strict_runs"), ESTIMATORS.index("weighted_clusters")
 

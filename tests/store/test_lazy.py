@@ -22,12 +22,9 @@ from gyrostab.jobs import checkpoint
 from gyrostab.jobs.run import load_log, run
 from gyrostab.store import write
 from gyrostab.store.lazy import (
-    InMemory,
-    can_read_directly,
     concatenate_columns,
     find_source,
     make_dask,
-    make_lazy,
     read_box,
     read_into,
     read_slice,
@@ -35,6 +32,7 @@ from gyrostab.store.lazy import (
     stack_rows,
     transpose_lazy,
 )
+from tests.support.stored import InMemory, make_lazy
 
 WINDOW = {"window": "40s", "step": "10s", "taus": "8"}
 
@@ -66,7 +64,7 @@ def placed(draw):
 def test_joined_samples_are_those_of_dask(made, data):
     rows, size = made
     joined = place_on_grid(rows, size, data.draw(st.integers(1, size)))
-    assert can_read_directly(joined)
+    assert find_source(joined) is not None
     begin = data.draw(st.integers(0, size))
     for row, expected in enumerate(joined.compute(scheduler="synchronous")):
         target = np.full(data.draw(st.integers(0, size - begin)), 7.0)
@@ -96,8 +94,8 @@ def test_runs_that_follow_each_other_are_read_with_one_slice():
 def test_what_is_derived_from_an_array_is_not_read_past_dask():
     joined = place_on_grid([[(np.arange(9.0), None, np.array([[0, 0, 9]]))]], 9, 4)
     doubled = 2.0 * joined
-    assert not can_read_directly(doubled)
-    assert not can_read_directly(joined[:, 1:])
+    assert find_source(doubled) is None
+    assert find_source(joined[:, 1:]) is None
     target = np.empty(3)
     read_into(doubled, 0, 4, target)
     np.testing.assert_array_equal(target, [8.0, 10.0, 12.0])
@@ -140,7 +138,7 @@ def test_stored_samples_are_those_of_dask(tmp_path, form):
     for name in ("rate", "temperature"):
         data = log[name].data
         assert isinstance(data, da.Array)
-        assert can_read_directly(data)
+        assert find_source(data) is not None
         whole = np.atleast_2d(data.compute())
         for begin, end in np.sort(rng.integers(0, data.shape[-1] + 1, (20, 2)), axis=1).tolist():
             for row, expected in enumerate(whole):
@@ -164,7 +162,7 @@ def test_a_joined_log_is_written_as_dask_would_give_it(tmp_path, monkeypatch, fo
         }
     )
     slow.rate.encoding = log.rate.encoding
-    assert not can_read_directly(slow.rate.data)
+    assert find_source(slow.rate.data) is None
     store = {"nc": to_netcdf, "zarr": to_zarr}[form]
     stored = []
     with warnings.catch_warnings():
@@ -310,7 +308,7 @@ def test_rows_are_put_on_the_grid_directly_as_by_dask(storage, scale, unit, monk
     placed = fill.rows_on_grid(
         raw, Placement(0, runs, np.empty((0, 5), np.int64)), chunk=512, scale=scale, unit=unit
     )
-    assert can_read_directly(placed)
+    assert find_source(placed) is not None
     expected = placed_by_hand(runs, 6100, rows)
     if scale != 1.0:
         expected = expected * scale if unit is None else np.rint(expected / unit) * (unit * scale)
@@ -330,16 +328,11 @@ def test_rows_are_put_on_the_grid_directly_as_by_dask(storage, scale, unit, monk
     )
 
 
-def test_an_array_in_memory_is_not_copied():
-    values = np.arange(24.0).reshape(2, 12)
-    lazy = make_lazy(values, 5)
-    assert lazy.chunks == ((2,), (5, 5, 2))
-    np.testing.assert_array_equal(lazy.compute(), values)
-    values[1, 7] = -1.0
-    assert lazy[1, 7].compute() == read_slice(lazy, 7, 8)[1, 0] == -1.0
-
-
-def test_columns_of_unlike_types_are_left_to_dask():
-    mixed = concatenate_columns([np.arange(3), make_lazy(np.arange(2.0), 10)], 10)
-    assert not can_read_directly(mixed)
-    np.testing.assert_array_equal(read_slice(mixed, 2, 4), [2.0, 0.0])
+def test_columns_of_unlike_types_are_converted_when_they_are_read():
+    lazy = da.from_array(np.arange(2.0), chunks=1)  # of another program
+    mixed = concatenate_columns([np.arange(3), make_lazy(np.arange(4.0, 6.0), 10), lazy], 3)
+    assert mixed.dtype == np.float64
+    np.testing.assert_array_equal(mixed.compute(), [0.0, 1.0, 2.0, 4.0, 5.0, 0.0, 1.0])
+    np.testing.assert_array_equal(read_slice(mixed, 2, 6), [2.0, 4.0, 5.0, 0.0])
+    stacked = stack_rows([lazy, np.array([7.0, 8.0])])
+    np.testing.assert_array_equal(stacked.compute(), [[0.0, 1.0], [7.0, 8.0]])

@@ -12,6 +12,7 @@ from gyrostab import make_log, open_log, to_netcdf
 from gyrostab.errors import OptionError
 from gyrostab.store import lazy, private
 from gyrostab.store.private import close_function, is_in_memory, library_lock
+from tests.support.stored import InMemory, make_lazy
 
 
 @pytest.fixture
@@ -57,14 +58,14 @@ def test_a_dataset_that_hides_its_close_function_is_closed_itself():
 
 
 def test_a_source_is_found_in_its_own_array_only():
-    made = lazy.make_lazy(np.arange(10.0), 4)
-    assert isinstance(lazy.find_source(made), lazy.InMemory)
+    made = make_lazy(np.arange(10.0), 4)
+    assert isinstance(lazy.find_source(made), InMemory)
     for other in (made + 1.0, made[2:], da.from_array(np.arange(10.0)), np.arange(10.0)):
         assert lazy.find_source(other) is None
 
 
 def test_an_array_without_its_source_is_read_by_dask(monkeypatch):
-    made = lazy.make_lazy(np.arange(10.0), 4)
+    made = make_lazy(np.arange(10.0), 4)
     monkeypatch.setattr(lazy, "_LAYER", "another-name-")
     assert lazy.find_source(made) is None
     np.testing.assert_array_equal(lazy.read_slice(made, 3, 9), np.arange(3.0, 9.0))

@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.io.datasets import to_netcdf, to_zarr
+from gyrostab.store.lazy import Source, make_dask
 from gyrostab.time.grid import time_coordinate
 
 WRITERS = {"nc": to_netcdf, "zarr": to_zarr}
@@ -18,6 +19,21 @@ RATE = 100.0
 CHUNK = 120_000  # 20 minutes at 100 Hz
 FACTOR = 0.1 / 3.0
 START = 1_790_000_000_123_456_789
+
+
+class InMemory(Source):
+    """An array in memory as a source."""
+
+    def __init__(self, values):
+        self.values, self.shape, self.dtype = values, values.shape, values.dtype
+
+    def __getitem__(self, box):
+        return self.values[box]
+
+
+def make_lazy(values, chunk: int):
+    """Wrap an array in memory as a dask array, in chunks along its last dimension."""
+    return make_dask(InMemory(values), (*values.shape[:-1], chunk))
 
 
 def counts_log(
