@@ -150,31 +150,24 @@ def _map_variable(block: Block, name: str) -> NDArray[Any]:
 
 def _make_lazy(blocks: Sequence[Block], name: str) -> Any:
     """Make a dask array that reads a variable along time from the block files."""
-    described = blocks[0].header["variables"][name]
-    along = described["dims"].index("time")
-    edges = np.cumsum([0, *(block.part.stop - block.part.start for block in blocks)])
-    shape = [int(edges[-1]) if i == along else size for i, size in enumerate(described["shape"])]
-    dims = list(zip(described["dims"], shape, strict=True))
+    source = _BlockSource(blocks, name)
+    dims = list(zip(source.dims, source.shape, strict=True))
     inner = math.prod(size for dim, size in dims if dim not in ("axis", "term", "time"))
-    sizes = {"axis": 1, "term": 1, "time": max(1, min(shape[along], CHUNK_VALUES // max(1, inner)))}
-
-    source = _BlockSource(blocks, name, along, edges, tuple(shape))
-    return make_dask(source, tuple(sizes.get(dim, size) for dim, size in dims))
+    length = max(1, min(int(source.edges[-1]), CHUNK_VALUES // max(1, inner)))
+    chunks = {"axis": 1, "term": 1, "time": length}
+    return make_dask(source, tuple(chunks.get(dim, size) for dim, size in dims))
 
 
 class _BlockSource(Source):
     """A variable along time in block files."""
 
-    def __init__(
-        self,
-        blocks: Sequence[Block],
-        name: str,
-        along: int,
-        edges: NDArray[np.int64],
-        shape: tuple[int, ...],
-    ):
-        self.blocks, self.name, self.along, self.edges = blocks, name, along, edges
-        self.shape, self.dtype = shape, np.dtype(blocks[0].header["variables"][name]["dtype"])
+    def __init__(self, blocks: Sequence[Block], name: str):
+        described = blocks[0].header["variables"][name]
+        self.blocks, self.name, self.dims = blocks, name, described["dims"]
+        self.along, self.dtype = self.dims.index("time"), np.dtype(described["dtype"])
+        self.edges = np.cumsum([0, *(block.part.stop - block.part.start for block in blocks)])
+        shape = described["shape"]
+        self.shape = (*shape[: self.along], int(self.edges[-1]), *shape[self.along + 1 :])
 
     def __getitem__(self, box: Any) -> NDArray[Any]:
         begin, end = box[self.along].start, box[self.along].stop
