@@ -12,9 +12,9 @@ import hashlib
 import os
 import re
 import tempfile
-import threading
 from collections.abc import Iterator
-from functools import lru_cache
+from contextvars import ContextVar
+from functools import cache
 from pathlib import Path, PurePath
 from typing import Any, Literal
 
@@ -209,36 +209,35 @@ def fetch_file(url: str) -> Path:
         info = filesystem.info(path)
         if info["type"] == "directory":
             raise FormatError(f"{url}: is a folder, not a Zarr store; name the files in it")
-        return _download_file(url, repr(info))
-
-
-@lru_cache(maxsize=2**10)
-def _download_file(url: str, info: str) -> Path:
-    """Download a file that the store describes by `info`, once for the process."""
-    with _open_filesystem(url) as (filesystem, path):
-        folder = tempfile.TemporaryDirectory(prefix="gyrostab-")
-        _COPIES.setdefault(threading.get_ident(), []).append(folder)
-        target = Path(folder.name, path.rpartition("/")[2])
-        filesystem.get_file(path, str(target))
+        state = hashlib.sha256(f"{url} {info!r}".encode()).hexdigest()
+        folder = Path(_COPIES.get() or _make_folder_of_process().name, state)
+        target = folder / path.rpartition("/")[2]
+        if not target.exists():
+            folder.mkdir(exist_ok=True)
+            filesystem.get_file(path, f"{folder}.part")
+            os.replace(f"{folder}.part", target)
         return target
 
 
-#: Folders of downloaded files by thread; removed when the process ends.
-_COPIES: dict[int, list[tempfile.TemporaryDirectory[str]]] = {}
+#: Folder of downloaded files in a block of `remove_copies`.
+_COPIES: ContextVar[str | None] = ContextVar("_COPIES", default=None)
+
+
+@cache
+def _make_folder_of_process() -> tempfile.TemporaryDirectory[str]:
+    """Make the folder of other downloaded files, which is removed when the process ends."""
+    return tempfile.TemporaryDirectory(prefix="gyrostab-")
 
 
 @contextlib.contextmanager
 def remove_copies() -> Iterator[None]:
-    """Remove the copies of files that this thread has downloaded in the block, at its end."""
-    copies = _COPIES.setdefault(threading.get_ident(), [])
-    n_before = len(copies)
-    try:
-        yield
-    finally:
-        if len(copies) > n_before:
-            _download_file.cache_clear()
-        while len(copies) > n_before:
-            copies.pop().cleanup()
+    """Remove the copies of files that this thread downloads in the block, at its end."""
+    with tempfile.TemporaryDirectory(prefix="gyrostab-") as folder:
+        token = _COPIES.set(folder)
+        try:
+            yield
+        finally:
+            _COPIES.reset(token)
 
 
 def remove_address(url: str) -> None:
