@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from gyrostab.ingest.grid.regularise import regularise as regularise
     from gyrostab.ingest.make_log import make_log as make_log
     from gyrostab.ingest.scan import scan as scan
+    from gyrostab.io.datasets import to_csv as to_csv
     from gyrostab.io.datasets import to_netcdf as to_netcdf
     from gyrostab.io.datasets import to_zarr as to_zarr
     from gyrostab.io.kalibr import to_kalibr as to_kalibr
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
     from gyrostab.io.opening import open_surface as open_surface
     from gyrostab.io.survey_files import to_iscwsa as to_iscwsa
     from gyrostab.io.survey_terms import survey_terms as survey_terms
-    from gyrostab.io.window_table import to_csv as to_csv
     from gyrostab.plot import plot_adev as plot_adev
     from gyrostab.plot import plot_coefficients as plot_coefficients
     from gyrostab.plot import plot_correlation as plot_correlation
@@ -88,7 +88,7 @@ _HOME = {
     "scan": "ingest.scan",
     "simulate": "simulate",
     "survey_terms": "io.survey_terms",
-    "to_csv": "io.window_table",
+    "to_csv": "io.datasets",
     "to_iscwsa": "io.survey_files",
     "to_kalibr": "io.kalibr",
     "to_netcdf": "io.datasets",

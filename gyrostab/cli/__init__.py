@@ -17,14 +17,15 @@ from collections.abc import Sequence
 
 from gyrostab.cli import commands
 from gyrostab.cli.console import (
+    app,
     attach_negative_values,
     describe_error,
+    find_inputs,
     print_error,
     read_config,
     show_plain_warnings,
     sigterm_as_interrupt,
 )
-from gyrostab.cli.frame import app, find_inputs
 from gyrostab.store.output import protect_inputs
 
 __all__ = ["app", "main"]

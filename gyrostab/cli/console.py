@@ -1,4 +1,7 @@
-"""Defaults from a file, warnings and errors as single lines, and orderly interruption."""
+"""The application and what its commands share: arguments, progress, defaults from a file.
+
+Warnings and errors are single lines, and an interruption is orderly.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +11,67 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Annotated, Any, TextIO
 
-from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
+from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, UnusedCliTokensError
 
-from gyrostab.cli.options import read_toml
+from gyrostab.cli.options import Common, read_toml
 from gyrostab.errors import SYSTEM_ERRNOS, GyrostabError, OptionError
+
+Logs = Annotated[list[Path], Parameter(name="LOG...", negative=())]
+Product = Annotated[Path, Parameter(name="PRODUCT")]
+Output = Annotated[Path, Parameter(name=["--output", "-o"], metavar="FILE")]
+
+app = App(
+    name="gyrostab",
+    help="Dynamic Allan variance of gyro logs: noise coefficients over time, and a diagnosis of "
+    "the physical effects that a simulation leaves out.",
+    help_epilogue="Try it: gyrostab demo -o demo-output. Help on a command: gyrostab run --help.",
+    version_flags=["--version"],
+    help_format="markdown",
+    suppress_keyboard_interrupt=False,
+)
+app.register_install_completion_command(
+    help="Install the completion of commands and options for this shell (bash, zsh, fish)."
+)
+
+
+@contextmanager
+def show_stages(common: Common) -> Iterator[Any]:
+    """Set the number of processor cores and show the progress of each stage."""
+    import dask
+
+    from gyrostab.progress import show_progress
+
+    chosen = {"num_workers": common.workers} if common.workers else {}
+    with (
+        dask.config.set(scheduler="threads", **chosen),
+        show_progress(quiet=common.quiet_progress) as stage,
+    ):
+        yield stage
+
+
+def find_inputs(arguments: Mapping[str, Any]) -> list[Path]:
+    """Find the input files of a command: its path arguments except the output, and TOML options.
+
+    Examples
+    --------
+    >>> output = Path("run7.nc")
+    >>> find_inputs({"logs": [Path("run7.csv")], "output": output, "map": ["names.toml"]})
+    [PosixPath('run7.csv'), PosixPath('names.toml')]
+    """
+    paths: list[Path] = []
+    for value in (value for name, value in arguments.items() if name != "output"):
+        if is_dataclass(value) and not isinstance(value, type):
+            paths += find_inputs(asdict(value))
+        for item in value if isinstance(value, list | tuple) else [value]:
+            if isinstance(item, Path) or (isinstance(item, str) and item.lower().endswith(".toml")):
+                paths.append(Path(item))
+    return paths
 
 
 def attach_negative_values(tokens: Sequence[str]) -> list[str]:

@@ -31,8 +31,7 @@ from typing import Any
 import xarray as xr
 
 from gyrostab.errors import OptionError
-from gyrostab.io.survey_model import SurveyModel, SurveyTerm
-from gyrostab.io.survey_tables import TABLES
+from gyrostab.io.survey_model import TABLES, SurveyModel, SurveyTerm
 from gyrostab.io.survey_terms import survey_terms
 from gyrostab.store.output import check_output, new_output
 from gyrostab.units import HOUR

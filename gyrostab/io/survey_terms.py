@@ -36,8 +36,7 @@ import xarray as xr
 
 from gyrostab.allan.summary import TermSummary, summarise_fit, summarise_terms
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.io.survey_model import Status, SurveyModel, SurveyTerm, Tool
-from gyrostab.io.survey_tables import KINDS, TABLES, Groups
+from gyrostab.io.survey_model import KINDS, TABLES, Groups, Status, SurveyModel, SurveyTerm, Tool
 from gyrostab.noise import LAWS
 from gyrostab.schema import texts
 from gyrostab.time.durations import duration_seconds

@@ -14,9 +14,8 @@ from typing import Any
 from gyrostab.allan.davar import davar_parts
 from gyrostab.allan.plan import make_plan
 from gyrostab.io.datasets import to_netcdf
-from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.engine import compute_part
-from gyrostab.jobs.load import load_log
+from gyrostab.jobs.load import check_options, load_log
 from gyrostab.progress import watch_compiler
 
 

@@ -31,7 +31,6 @@ from gyrostab.jobs.archive import (
     index_files,
     is_fleet,
 )
-from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.fleet_output import (
     PLOTLY_FILE,
     REQUESTS,
@@ -64,6 +63,7 @@ from gyrostab.jobs.job import (
     make_fingerprint,
     remove_job,
 )
+from gyrostab.jobs.load import check_options
 from gyrostab.jobs.run import find_job_name, read_job_name, run
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
 from gyrostab.progress import Stage, no_stage

@@ -94,7 +94,7 @@ def describe_inputs(paths: Sequence[Path]) -> list[dict[str, Any]]:
 def make_fingerprint(paths: Sequence[Path], options: Mapping[str, Any]) -> dict[str, Any]:
     """Collect all that a product depends on: inputs in order, options, versions and machine.
 
-    The options are those of `gyrostab.jobs.checks.check_options`; fitting is None without a fit.
+    The options are those of `gyrostab.jobs.load.check_options`; fitting is None without a fit.
     """
     plain = {**options["reading"], **options["windows"]}
     plain |= {f"fit {name}": value for name, value in (options["fitting"] or {}).items()}

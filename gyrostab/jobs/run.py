@@ -16,7 +16,6 @@ import xarray as xr
 from gyrostab.errors import FormatError, GyrostabError, OutputError, ResumeError
 from gyrostab.io.datasets import to_netcdf, to_zarr
 from gyrostab.jobs.checkpoint import assemble, find_blocks
-from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.engine import (
     Blocks,
     compute_blocks,
@@ -39,6 +38,7 @@ from gyrostab.jobs.job import (
     remove_job,
     remove_remains,
 )
+from gyrostab.jobs.load import check_options
 from gyrostab.jobs.load import count_samples as count_samples
 from gyrostab.jobs.load import load_log as load_log
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool

@@ -27,7 +27,6 @@ from gyrostab.ingest.uniform import cut_log
 from gyrostab.io.growing import LayoutError, write_windows
 from gyrostab.io.opening import open_product
 from gyrostab.jobs.alarms import Alarm, check_alarms, describe_windows
-from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.engine import compute_part, find_record_bands
 from gyrostab.jobs.follow import FileMemory, FileStates, RowKeeper, hash_samples, list_files
 from gyrostab.jobs.job import (
@@ -37,7 +36,7 @@ from gyrostab.jobs.job import (
     make_fingerprint,
     remove_job,
 )
-from gyrostab.jobs.load import load_log
+from gyrostab.jobs.load import check_options, load_log
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.schema import log_channels, signal_name, texts
 from gyrostab.store.lazy import find_source

@@ -49,8 +49,9 @@ from gyrostab.store.times import (
     time_attributes,
 )
 
-#: Dimensions in the order of the file; those not named keep their place between `tau` and `time`.
-_ORDER = ("axis", "term", "tau")
+#: Dimensions in the order of the file, and in memory; other ones keep their order at the dots.
+_DISK_ORDER = ("axis", "term", "tau", ..., "time", "bnds")
+_MEMORY_ORDER = ("axis", ..., "tau", "term", "bnds")
 #: Labels of variables that have none.
 _LONG_NAMES = {**SIGNAL_LONG_NAMES, "axis": VARIABLES["axis"]["long_name"]}
 #: What the encoding of integer counts consists of, where a reader declares them.
@@ -93,11 +94,7 @@ def to_disk(
             )
             continue
         is_index = name in dataset.dims
-        stored = (
-            variable
-            if is_index
-            else transpose_lazy(_make_lazy(variable), _disk_order(variable.dims))
-        )
+        stored = variable if is_index else transpose_lazy(_make_lazy(variable), _DISK_ORDER)
         label = _LONG_NAMES.get(str(name), str(name).replace("_", " "))
         attrs = encode_attributes({"long_name": label, **variable.attrs})
         data = variable.values if is_index else stored.data
@@ -130,15 +127,6 @@ def to_disk(
         stored_set["avar"].attrs["ancillary_variables"] = " ".join(ancillary)
     stored_set.attrs = make_global_attributes(dataset, kind, verb)
     return stored_set
-
-
-def _disk_order(dims: tuple[Any, ...]) -> list[Any]:
-    last = [dim for dim in ("time", "bnds") if dim in dims]
-    return (
-        [dim for dim in _ORDER if dim in dims]
-        + [dim for dim in dims if dim not in (*_ORDER, *last)]
-        + last
-    )
 
 
 def _make_lazy(variable: xr.Variable) -> xr.Variable:
@@ -177,7 +165,7 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
             with contextlib.suppress(OverflowError, TypeError, ValueError):  # damaged
                 opened.attrs[flags] = np.array(opened.attrs[flags], opened.dtype, ndmin=1)
         opened.dims = tuple(dims.get(dim, dim) for dim in opened.dims)
-        variables[name] = opened.transpose(*_memory_order(opened.dims))
+        variables[name] = opened.transpose(*_MEMORY_ORDER, missing_dims="ignore")
     small_coords = xr.Coordinates(
         {
             name: variables.pop(name)
@@ -200,10 +188,3 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
     dataset = restore_names(dataset)
     dataset.set_close(close)
     return dataset
-
-
-def _memory_order(dims: tuple[Any, ...]) -> list[Any]:
-    last = [dim for dim in ("tau", "term", "bnds") if dim in dims]
-    return (
-        sorted((dim for dim in dims if dim not in last), key=lambda dim: bool(dim != "axis")) + last
-    )

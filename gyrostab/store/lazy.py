@@ -321,10 +321,13 @@ class _Transposed(Source):
 
 
 def transpose_lazy(variable: Any, dims: Sequence[Any]) -> Any:
-    """Transpose a variable of xarray; a source can still be read."""
-    turned = variable.transpose(*dims)
+    """Transpose a variable of xarray; a source can still be read.
+
+    `dims` as for `xarray.Variable.transpose`; those that the variable lacks are left out.
+    """
+    turned = variable.transpose(*dims, missing_dims="ignore")
     source = find_source(variable.data) if variable.chunks is not None else None
-    if source is None or variable.dims == tuple(dims):
+    if source is None or variable.dims == turned.dims:
         return turned
-    order = [variable.dims.index(dim) for dim in dims]
+    order = [variable.dims.index(dim) for dim in turned.dims]
     return turned.copy(data=make_dask(_Transposed(source, order), turned.chunks))

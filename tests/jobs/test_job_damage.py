@@ -10,7 +10,6 @@ import pytest
 
 from gyrostab import make_log, to_zarr
 from gyrostab.errors import OutputError
-from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.job import (
     begin_job,
     check_job_folder,
@@ -18,6 +17,7 @@ from gyrostab.jobs.job import (
     read_job,
     remove_remains,
 )
+from gyrostab.jobs.load import check_options
 
 
 def flip(content: bytes, place: int, bit: int) -> bytes:

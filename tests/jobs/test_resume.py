@@ -306,8 +306,8 @@ def test_changes_refuse_to_resume_and_say_what(log, tmp_path, after_two, monkeyp
 
 def test_a_zarr_store_with_a_changed_chunk_is_noticed(log, tmp_path):
     from gyrostab import to_zarr
-    from gyrostab.jobs.checks import check_options
     from gyrostab.jobs.job import describe_differences, make_fingerprint
+    from gyrostab.jobs.load import check_options
 
     store = to_zarr(open_log(log), tmp_path / "run7.zarr")
     before = make_fingerprint([store], check_options())

@@ -25,8 +25,8 @@ from gyrostab.io.opening import open_product
 from gyrostab.jobs import follow as follow_module
 from gyrostab.jobs import watch as module
 from gyrostab.jobs.alarms import check_alarms, parse_alarm
-from gyrostab.jobs.checks import check_options
 from gyrostab.jobs.live_page import LivePage
+from gyrostab.jobs.load import check_options
 from gyrostab.jobs.run import run
 from gyrostab.jobs.watch import rows_folder, watch
 

@@ -9,7 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gyrostab.cli.frame import app
+from gyrostab.cli.console import app
 from gyrostab.cli.options import Common
 from gyrostab.errors import GyrostabError
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from gyrostab.cli.frame import Output, app, show_stages
+from gyrostab.cli.console import Output, app, show_stages
 from gyrostab.cli.options import Common, Fitting, Reading, Windows
 from gyrostab.store.remote import find_url
 from gyrostab.wording import list_some

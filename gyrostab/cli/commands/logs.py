@@ -7,7 +7,7 @@ import sys
 from functools import partial
 from typing import TYPE_CHECKING, Literal
 
-from gyrostab.cli.frame import Logs, Output, app, show_stages
+from gyrostab.cli.console import Logs, Output, app, show_stages
 from gyrostab.cli.options import Common, Reading
 from gyrostab.errors import FormatError, OptionError
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from gyrostab.cli.frame import Output, Product, app, show_stages
+from gyrostab.cli.console import Output, Product, app, show_stages
 from gyrostab.cli.options import ChannelFile, Common, Survey
 from gyrostab.errors import OptionError
 
@@ -186,11 +186,10 @@ def export(
     log
         Log of the product, for kalibr: adds the noise of the channels accel_x, accel_y and accel_z.
     """
-    from gyrostab.io.datasets import to_zarr
+    from gyrostab.io.datasets import to_csv, to_zarr
     from gyrostab.io.kalibr import to_kalibr
     from gyrostab.io.opening import open_log, open_product
     from gyrostab.io.survey_files import SUFFIXES, to_iscwsa
-    from gyrostab.io.window_table import to_csv
     from gyrostab.jobs.fleet_table import open_fleet
     from gyrostab.store.output import check_output
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from gyrostab.cli.frame import app, show_stages
+from gyrostab.cli.console import app, show_stages
 from gyrostab.cli.options import Common, Flag, whole_number
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from gyrostab.cli.frame import Output, app, show_stages
+from gyrostab.cli.console import Output, app, show_stages
 from gyrostab.cli.options import Common, Reading, whole_number
 from gyrostab.errors import OptionError
 

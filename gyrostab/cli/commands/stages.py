@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from gyrostab.cli.frame import Logs, Output, app, show_stages
+from gyrostab.cli.console import Logs, Output, app, show_stages
 from gyrostab.cli.options import Common, Fitting, Flag, Reading, Running, Windows
 
 

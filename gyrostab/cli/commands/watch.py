@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from gyrostab.cli.frame import Output, app
+from gyrostab.cli.console import Output, app
 from gyrostab.cli.options import Common, Fitting, Reading, Windows, whole_number
 
 if TYPE_CHECKING:
