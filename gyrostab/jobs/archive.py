@@ -46,8 +46,6 @@ RESERVED_NAMES = (
 DIAGNOSIS = "diagnosis"
 #: Bytes at the beginning of a diagnosis that contain the name of its schema, its first entry.
 _SCHEMA_BYTES = 256
-#: Files that a worker inspects in one call: a call of dask takes a millisecond.
-_FILES_PER_CALL = 50
 
 
 @dataclass(frozen=True)
@@ -220,18 +218,11 @@ def index_files(
     for name in diagnosed:
         rows[name] |= {"is_log": False, "format": DIAGNOSIS, "note": ""}
     names = [name for name in changed if name not in diagnosed]
-    batches = [names[at : at + _FILES_PER_CALL] for at in range(0, len(names), _FILES_PER_CALL)]
-    done = 0
-    for _, result in run_calls(pool, ((_describe_logs, batch, dict(reading)) for batch in batches)):
-        for name, described in result.items():
-            rows[name].update(described)
-        done += len(result)
+    calls = ((_describe_log, name, dict(reading)) for name in names)
+    for done, (call, described) in enumerate(run_calls(pool, calls), 1):
+        rows[call[1]].update(described)
         stage("indexing", len(names), done, "files")
     return pd.DataFrame(list(rows.values()))
-
-
-def _describe_logs(names: Sequence[str], reading: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    return {name: _describe_log(name, reading) for name in names}
 
 
 def _describe_log(name: str, reading: Mapping[str, Any]) -> dict[str, Any]:
