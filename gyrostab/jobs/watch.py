@@ -15,6 +15,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Protocol
 
@@ -152,10 +153,15 @@ def watch(
             try:
                 keeper = None
                 if source == "-":
-                    _check_rows(path, overwrite=overwrite)
+                    if overwrite and rows_folder(path).exists():
+                        raise OutputError(
+                            f"{rows_folder(path)} holds the rows of an earlier live view, which a "
+                            "new one would include; move or remove that folder, or give another "
+                            "name with -o"
+                        )
                     keeper = RowKeeper(stream or sys.stdin.buffer, rows_folder(path))
                 attrs = {_IDENTITY: json.dumps(identity)}
-                view = _View(path, options, attrs, wait, list(alarms), listener, until)
+                view = _View(path, options, attrs, wait, alarms, listener, until)
                 _follow_source(view, place, keeper, quiet, poll)
             finally:
                 remove_job(folder, output=resolve_link(path))
@@ -183,14 +189,6 @@ def _follow_source(
     view.memory.ended = True
     view.take_files(list_files(source))
     view.update(final=True)
-
-
-def _check_rows(path: Path, *, overwrite: bool) -> None:
-    if overwrite and rows_folder(path).exists():
-        raise OutputError(
-            f"{rows_folder(path)} holds the rows of an earlier live view, which a new one would "
-            "include; move or remove that folder, or give another name with -o"
-        )
 
 
 def _continue_product(
@@ -228,38 +226,37 @@ def _continue_product(
     return until
 
 
+@dataclass
 class _View:
     """The product so far, and which samples it was computed from."""
 
-    def __init__(
-        self,
-        path: Path,
-        options: dict[str, Any],
-        attrs: dict[str, str],
-        lateness: float,
-        alarms: list[Alarm],
-        listener: Listener,
-        until: np.datetime64 | None,
-    ):
-        self.path, self.options, self.attrs, self.lateness = path, options, attrs, lateness
-        self.alarms, self.listener = alarms, listener
-        self.until = until  # last window that this call, or an earlier one, has shown
-        self.exists = until is not None
-        self.memory = FileMemory()
-        self.space = Workspace()
-        self.digests: list[bytes] = []
-        self.common = ""
-        self.shown = 0  # windows
-        self.missing_samples, self.samples, self.bytes = 0, 0, 0
-        self.next_update = 0.0
-        self.notes: set[str] = set()
-        self.is_new_data = False
+    path: Path
+    options: dict[str, Any]
+    attrs: dict[str, str]
+    lateness: float  # s
+    alarms: Sequence[Alarm]
+    listener: Listener
+    until: np.datetime64 | None  # last window that this call, or an earlier one, has shown
+    memory: FileMemory = field(default_factory=FileMemory)
+    space: Workspace = field(default_factory=Workspace)
+    digests: list[bytes] = field(default_factory=list)
+    common: str = ""
+    shown: int = 0  # windows
+    missing_samples: int = 0
+    samples: int = 0
+    n_bytes: int = 0
+    next_update: float = 0.0
+    notes: set[str] = field(default_factory=set)
+    is_new_data: bool = False
+
+    def __post_init__(self) -> None:
+        self.exists = self.until is not None
 
     def take_files(self, files: FileStates) -> None:
         """Take over a new list of files."""
         if self.memory.update(files):
             self.digests, self.common = [], ""
-            self.shown, self.missing_samples, self.bytes = 0, 0, 0
+            self.shown, self.missing_samples, self.n_bytes = 0, 0, 0
             text = "a file was cut, replaced or removed, so the product is computed again"
             if self.until is not None:
                 text += f"; windows up to {self.until} are not shown again"
@@ -289,8 +286,8 @@ class _View:
     def _is_due(self) -> bool:
         """Whether a new window may be complete: by the time of the last update, and by bytes."""
         held = sum(state["bytes"] for state in self.memory.files.values())
-        needed = _DUE_SHARE * self.missing_samples * self.bytes / max(self.samples, 1)
-        return time.monotonic() >= self.next_update and held >= self.bytes + needed
+        needed = _DUE_SHARE * self.missing_samples * self.n_bytes / max(self.samples, 1)
+        return time.monotonic() >= self.next_update and held >= self.n_bytes + needed
 
     def _show_note(self, text: str) -> None:
         """Show a note once, and again when the number of rows in it changes."""
@@ -312,7 +309,7 @@ class _View:
 
     def _update_product(self, *, final: bool) -> None:
         log, windows = self._load_rows(), self.options["windows"]
-        self.bytes = sum(state["bytes"] for state in self.memory.files.values())
+        self.n_bytes = sum(state["bytes"] for state in self.memory.files.values())
         self.samples = log.sizes["time"]
         rate = float(log.attrs["sampling_rate_hz"])
         wait = 0 if final else round(self.lateness * rate)

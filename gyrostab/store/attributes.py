@@ -18,7 +18,7 @@ import xarray as xr
 
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.schema import texts
-from gyrostab.store.hdf5_heaps import check_global_heaps
+from gyrostab.store.damage import check_global_heaps
 from gyrostab.store.output.content import read_json
 from gyrostab.store.private import library_lock
 from gyrostab.store.remote import find_url
@@ -114,17 +114,12 @@ def make_global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[st
     return encode_attributes(attrs)
 
 
-def decode_json(attrs: dict[str, Any]) -> None:
-    """Decode the attributes that are JSON, whose names are in one of them."""
-    text = str(attrs.pop(JSON_NAMES, ""))
-    names = json.loads(text) if text.startswith("[") else text.split()  # of an earlier version
-    for name in set(names) & set(attrs):
-        attrs[name] = json.loads(attrs[name])
-
-
 def decode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
     """Convert attributes of a file back; those that concern only the file are dropped."""
-    decode_json(attrs)
+    names = str(attrs.pop(JSON_NAMES, ""))
+    known = json.loads(names) if names.startswith("[") else names.split()  # of an earlier version
+    for name in set(known) & set(attrs):
+        attrs[name] = json.loads(attrs[name])
     for name, value in attrs.items():
         attrs[name] = value.item() if isinstance(value, np.generic) else value
     if "since" in str(attrs.get("units", "")):

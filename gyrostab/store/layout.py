@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, reading_of
-from gyrostab.store.blosc_chunks import is_blosc_cut
+from gyrostab.store.damage import is_blosc_cut
 from gyrostab.store.private import library_lock
 
 #: Variables whose layout is cached: several for each file of a long archive.

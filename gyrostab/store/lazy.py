@@ -208,14 +208,19 @@ class Converted(Source):
         return self.convert(read_box(self.parts[0], box if isinstance(box, tuple) else (box,)))
 
 
+def convert_lazy(array: Any, convert: Callable[[NDArray[Any]], NDArray[Any]], dtype: Any) -> Any:
+    """Return a dask array of converted values; a source can still be read."""
+    if find_source(array) is not None:
+        return make_dask(Converted(array, convert, dtype), array.chunks)
+    return array.map_blocks(convert, dtype=dtype, meta=np.empty((0,) * array.ndim, dtype))
+
+
 def hide_infinite(array: Any) -> Any:
     """Return an array with NaN in the place of infinite values, lazy if it is."""
     if array.dtype.kind != "f":
         return array
-    if find_source(array) is not None:
-        return make_dask(Converted(array, hide_infinite, array.dtype), array.chunks)
     if hasattr(array, "dask"):
-        return array.map_blocks(hide_infinite, dtype=array.dtype)
+        return convert_lazy(array, hide_infinite, array.dtype)
     infinite = np.isinf(array)
     return np.where(infinite, array.dtype.type(np.nan), array) if infinite.any() else array
 

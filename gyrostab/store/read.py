@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import DamageError, FormatError, reading_of
 from gyrostab.kernels.encoding.counts import from_counts
-from gyrostab.store.blosc_chunks import check_blosc_chunks
-from gyrostab.store.hdf5_heaps import check_global_heaps
+from gyrostab.store.damage import check_blosc_chunks, check_global_heaps
 from gyrostab.store.layout import ChunkCache, ChunkDamage, is_readable, read_chunk
 from gyrostab.store.lazy import FileVariable, RowSource, make_dask
 from gyrostab.store.private import close_function

@@ -18,7 +18,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, SchemaError
-from gyrostab.store.blosc_chunks import check_blosc_chunks
+from gyrostab.store.damage import check_blosc_chunks
 from gyrostab.store.lazy import RowSource, make_dask
 from gyrostab.time.grid import TimeGridIndex, grid_times, period_ns, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds

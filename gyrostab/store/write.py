@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gyrostab.kernels.encoding.counts import to_counts
 from gyrostab.store.layout import find_hdf5_codecs
-from gyrostab.store.lazy import Converted, find_source, make_dask, read_box
+from gyrostab.store.lazy import convert_lazy, find_source, read_box
 from gyrostab.store.private import library_lock
 from gyrostab.store.threads import MAX_WORKERS, map_in_order
 
@@ -77,12 +77,7 @@ def as_counts(name: str, variable: xr.Variable) -> xr.Variable:
     dtype = "int16" if declared.itemsize == 1 or declared == np.int16 else "int32"
     pack = partial(_pack_counts, name=name, scale=float(scale), dtype=dtype)
     data = variable.data
-    if variable.chunks is None:
-        packed = pack(data)
-    elif find_source(data) is not None:
-        packed = make_dask(Converted(data, pack, dtype), data.chunks)
-    else:
-        packed = data.map_blocks(pack, dtype=dtype, meta=np.empty((0,) * variable.ndim, dtype))
+    packed = pack(data) if variable.chunks is None else convert_lazy(data, pack, dtype)
     return xr.Variable(
         variable.dims,
         packed,

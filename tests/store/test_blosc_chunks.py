@@ -14,7 +14,7 @@ import zarr
 from gyrostab import davar, make_log, open_product, read_log, scan, to_zarr
 from gyrostab.allan.fit import fit_noise
 from gyrostab.errors import FormatError
-from gyrostab.store.blosc_chunks import check_blosc_chunks, is_blosc_cut
+from gyrostab.store.damage import check_blosc_chunks, is_blosc_cut
 from gyrostab.store.output import find_foreign_item
 
 

@@ -8,8 +8,8 @@ import h5py
 import pytest
 
 from gyrostab.errors import FormatError
-from gyrostab.store import hdf5_heaps
-from gyrostab.store.hdf5_heaps import check_global_heaps
+from gyrostab.store import damage
+from gyrostab.store.damage import check_global_heaps
 
 _FREE = struct.Struct("<HHIQ")
 
@@ -68,8 +68,8 @@ def test_the_end_of_a_long_file_is_searched(tmp_path, monkeypatch, block):
         file["numbers"] = range(100_000)
         file["words"] = ["word"] * 3
     data = bytearray(path.read_bytes())
-    monkeypatch.setattr(hdf5_heaps, "_SEARCHED_BYTES", 2**14)
-    monkeypatch.setattr(hdf5_heaps, "_BLOCK_BYTES", block)
+    monkeypatch.setattr(damage, "_SEARCHED_BYTES", 2**14)
+    monkeypatch.setattr(damage, "_BLOCK_BYTES", block)
     assert data.index(b"GCOL") > 2**14
     check_global_heaps(path)
     _FREE.pack_into(data, _free_space(data), 0, 0, 0, 0)

@@ -39,7 +39,7 @@ from gyrostab.ingest.formats.tables import (
 )
 from gyrostab.ingest.limits import check_chunk
 from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.store.hdf5_heaps import check_global_heaps
+from gyrostab.store.damage import check_global_heaps
 from gyrostab.time.stamps import to_nanoseconds
 
 HDF_SUFFIXES = (".h5", ".hdf5")

@@ -19,9 +19,8 @@ from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
 from gyrostab.store.attributes import read_attribute
-from gyrostab.store.blosc_chunks import check_blosc_chunks
 from gyrostab.store.cf import from_disk
-from gyrostab.store.hdf5_heaps import check_global_heaps
+from gyrostab.store.damage import check_blosc_chunks, check_global_heaps
 from gyrostab.store.read import open_stored
 from gyrostab.store.remote import find_url
 from gyrostab.store.times import decode_stamps
