@@ -231,7 +231,10 @@ def _compute_magnitudes(
     """Compute kind -> axis -> magnitude from the coefficients."""
     coefficients: dict[str, dict[str, _Magnitude]] = {}
     for summary in summaries:
-        chosen = _choose_statistic(summary, statistic)
+        chosen = _Magnitude(summary.value, 0.0, summary.value, summary.status)
+        if summary.status == "observed":
+            value = summary.median if statistic == "median" else summary.high
+            chosen = _Magnitude(value, summary.low, summary.high, "observed")
         coefficients.setdefault(summary.axis, {})[summary.symbol] = chosen
 
     def combine(formula: Callable[..., float], symbols: str) -> dict[str, _Magnitude]:
@@ -253,13 +256,6 @@ def _compute_magnitudes(
     return {
         "noise": combine(noise, "N"), "walk": combine(float, "N"), "bias": bias, "drift": bias,
     }  # fmt: skip
-
-
-def _choose_statistic(summary: TermSummary, statistic: Statistic) -> _Magnitude:
-    if summary.status == "observed":
-        value = summary.median if statistic == "median" else summary.high
-        return _Magnitude(value, summary.low, summary.high, "observed")
-    return _Magnitude(summary.value, 0.0, summary.value, summary.status)
 
 
 def _find_worst(magnitudes: Iterable[_Magnitude]) -> Status:

@@ -70,7 +70,9 @@ def check_blosc_chunks(folder: Path, *, skip: Collection[Any] = ()) -> None:
     for array in _find_blosc_arrays(folder):
         if array.name in skip:
             continue
-        for path in _find_chunks(array):
+        for path in (Path(place, name) for place, _, names in os.walk(array) for name in names):
+            if path.name in METADATA or UNFINISHED.search(path.name):
+                continue
             # another process may replace or remove a chunk meanwhile
             with suppress(FileNotFoundError), path.open("rb") as file:
                 header = file.read(_HEADER_BYTES)
@@ -121,12 +123,6 @@ def _uses_blosc(metadata: Any) -> bool:
         return bool(metadata["codecs"][-1]["name"] == "blosc")
     except (LookupError, TypeError):
         return False
-
-
-def _find_chunks(array: Path) -> Iterator[Path]:
-    for place, _, names in os.walk(array):
-        finished_names = (name for name in names if not UNFINISHED.search(name))
-        yield from (Path(place, name) for name in finished_names if name not in METADATA)
 
 
 def check_global_heaps(path: Path) -> None:

@@ -43,27 +43,19 @@ def sync_path(path: Path) -> None:
     """Bring a file, or the entries of a folder, to the disk.
 
     Windows cannot open a folder, and its file system keeps a journal of the entries; a file must
-    be open for writing there.
+    be open for writing there. On macOS, `os.fsync` leaves the cache of the drive alone.
     """
     can_open_folders = hasattr(os, "O_DIRECTORY")
     if path.is_dir() and not can_open_folders:
         return
     handle = os.open(path, os.O_RDONLY if can_open_folders else os.O_RDWR)
     try:
-        _flush_drive(handle)
+        if hasattr(_FCNTL, "F_FULLFSYNC"):
+            with contextlib.suppress(OSError):  # a file system without this command
+                _FCNTL.fcntl(handle, _FCNTL.F_FULLFSYNC)
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _flush_drive(handle: int) -> None:
-    """Empty the cache of the drive, which `os.fsync` leaves alone on macOS."""
-    command = getattr(_FCNTL, "F_FULLFSYNC", None)
-    if command is not None:
-        try:
-            _FCNTL.fcntl(handle, command)
-        except OSError:  # a file system without this command
-            return
 
 
 def rename_with_flag(source: Path, target: Path, flag: str) -> bool:

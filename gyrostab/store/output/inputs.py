@@ -95,8 +95,11 @@ def protect_inputs(
     gyrostab.errors.OptionError: output '...log.nc' is also an input and would be destroyed; give...
     """
     protected = _PROTECTED.get() or {}
-    files = {path: _describe_data(path) for path in match_files(paths) if path not in protected}
-    token = _PROTECTED.set({**protected, **files})
+    files: dict[Path, dict[str, Any] | None] = {}
+    for path in match_files(paths):
+        is_data = path.suffix.lower() != ".toml" and (path.is_file() or is_store(path))
+        files[path] = describe_file(path) if is_data and path not in protected else None
+    token = _PROTECTED.set({**files, **protected})
     try:
         yield
     finally:
@@ -112,12 +115,6 @@ def follow_inputs(paths: Iterable[str | os.PathLike[str]]) -> Iterator[None]:
         yield
     finally:
         _PROTECTED.reset(token)
-
-
-def _describe_data(path: Path) -> dict[str, Any] | None:
-    """Describe a regular file or a store for a later comparison; None for other paths."""
-    data = path.suffix.lower() != ".toml" and (path.is_file() or is_store(path))
-    return describe_file(path) if data else None
 
 
 def protected_inputs() -> list[Path]:
