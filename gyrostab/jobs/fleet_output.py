@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -16,7 +15,7 @@ from gyrostab.jobs.archive import FLEET_MARK, FLEET_SCHEMA, Archive
 from gyrostab.jobs.fleet_table import is_zarr
 from gyrostab.jobs.job import describe_differences
 from gyrostab.store.output import read_json, write_text
-from gyrostab.store.remote import find_kind, find_url, full_name, has_file
+from gyrostab.store.remote import exists, find_kind, find_url, full_name
 
 REQUESTS = 16  # to an object store at a time
 _GROUP = {"zarr_format": 2}  # metadata of a Zarr group
@@ -54,7 +53,7 @@ def check_update(
     """
     listed = {full_name(path) for path in [*archive.files, *archive.diagnoses]}
     known_names: Any = [] if known_table is None else known_table["file"]
-    other = next((name for name in known_names if name not in listed and _file_exists(name)), None)
+    other = next((name for name in known_names if name not in listed and exists(name)), None)
     plain = json.loads(json.dumps(options, default=str))
     same: dict[str, Any] = {"inputs": [], "versions": {}}
     changes = (
@@ -68,11 +67,6 @@ def check_update(
             "options to bring it up to date, --overwrite (overwrite=True) to replace its results, "
             "or another name with -o"
         )
-
-
-def _file_exists(name: str) -> bool:
-    url = find_url(name)
-    return bool(find_kind(url, required=False)) if url else os.path.exists(name)
 
 
 def read_options(target: Path) -> dict[str, Any]:
@@ -106,7 +100,7 @@ def make_folders(target: Path, folder: Path) -> None:
     for group in [folder, *folder.parents] if is_zarr(target) else ():
         if group == target:
             break
-        if not has_file(group / ".zgroup"):
+        if not exists(group / ".zgroup"):
             write_text(group / ".zgroup", json.dumps(_GROUP))
 
 

@@ -143,13 +143,13 @@ def find_kind(
     return None
 
 
-def has_file(path: Path) -> bool:
-    """Whether there is a file under a name or address."""
+def exists(path: str | Path) -> bool:
+    """Whether there is something under a name or address."""
     url = find_url(path)
     if url is None:
-        return path.is_file()
+        return os.path.exists(path)
     with _open_filesystem(url) as (filesystem, place):
-        return bool(filesystem.isfile(place))
+        return bool(filesystem.exists(place))
 
 
 def read_bytes(path: str | Path, count: int | None = None) -> bytes:
