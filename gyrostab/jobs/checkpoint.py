@@ -25,7 +25,6 @@ from gyrostab.store.output import replace_file
 _MAGIC = b"GYROBLK1"
 _ALIGN_BYTES = 64
 _DIGEST_BYTES = hashlib.sha256().digest_size
-_MAX_MEMORY_BYTES = 2**26  # bytes of blocks up to which a product is put together in memory
 
 
 class Block(NamedTuple):
@@ -114,18 +113,16 @@ def _read_verified_header(path: Path) -> bytes:
 
 
 def assemble(blocks: Sequence[Block]) -> xr.Dataset:
-    """Assemble blocks in their order to one dataset, in memory if it is small.
+    """Assemble blocks in their order to one dataset.
 
-    The long variables of a large one are dask arrays, in the chunks of the file that will be
-    written.
+    Its variables along time are dask arrays, in the chunks of the file that will be written.
     """
     first = blocks[0].header
-    is_small = sum(block.path.stat().st_size for block in blocks) <= _MAX_MEMORY_BYTES
     variables = {}
     for name, described in first["variables"].items():
         if "time" not in described["dims"]:
             data = _map_variable(blocks[0], name).copy()
-        elif is_small or name in first["coords"]:
+        elif name in first["coords"]:
             parts = [_map_variable(block, name) for block in blocks]
             data = np.concatenate(parts, axis=described["dims"].index("time"))
         else:

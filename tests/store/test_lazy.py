@@ -10,7 +10,7 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gyrostab import make_log, open_product, to_netcdf, to_zarr
+from gyrostab import make_log, to_netcdf, to_zarr
 from gyrostab.allan.fit import fit_noise, fit_part
 from gyrostab.ingest.columns.pieces import Spool
 from gyrostab.ingest.concat.core import concatenate_logs
@@ -177,29 +177,19 @@ def test_a_joined_log_is_written_as_dask_would_give_it(tmp_path, monkeypatch, fo
     np.testing.assert_array_equal(stored[0].rate.values, log.rate.values)
 
 
-def test_the_large_variables_of_a_large_product_are_written_without_dask(tmp_path, monkeypatch):
+def test_the_variables_of_a_product_are_written_without_dask(tmp_path, monkeypatch):
     paths, direct = stored_logs(tmp_path, "zarr"), []
 
     def watched(array, box):
         direct.append(find_source(array) is not None)
         return read_box(array, box)
 
-    monkeypatch.setattr(checkpoint, "_MAX_MEMORY_BYTES", 0)
     monkeypatch.setattr(write, "read_box", watched)
-    monkeypatch.setattr(write, "_MIN_LARGE_VALUES", 1000)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        run(paths, tmp_path / "large.nc", windows=WINDOW)
-        assert direct
-        assert all(direct)
-        monkeypatch.setattr(checkpoint, "_MAX_MEMORY_BYTES", 2**30)
-        run(paths, tmp_path / "small.nc", windows=WINDOW)
-    small, large = (
-        open_product(tmp_path / f"{name}.nc").compute().drop_attrs(deep=False)
-        for name in ("small", "large")
-    )
-    xr.testing.assert_identical(small, large)
-    assert small.edf.size >= 1000 > small.N.size
+        run(paths, tmp_path / "product.nc", windows=WINDOW)
+    assert direct
+    assert all(direct)
 
 
 def test_a_part_of_a_variable_in_blocks_is_that_of_the_whole(tmp_path):
