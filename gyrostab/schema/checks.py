@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from typing import Any
 
 import numpy as np
@@ -82,7 +82,7 @@ def require_dataset(dataset: Any, kind: str) -> None:
         )
 
 
-def _require_variables(dataset: xr.Dataset, kind: str, dims: dict[str, tuple[str, ...]]) -> None:
+def _require_variables(dataset: xr.Dataset, kind: str, dims: Mapping[str, tuple[str, ...]]) -> None:
     require_dataset(dataset, kind)
     for name, expected in dims.items():
         if name not in dataset.variables:
@@ -200,10 +200,8 @@ def check_surface(surface: xr.Dataset) -> None:
     _require_variables(
         surface,
         "DAVAR surface",
-        dict.fromkeys(("avar", "count", "coverage", "edf", "estimator"), cube),
-    )
-    _require_variables(
-        surface, "DAVAR surface", dict.fromkeys(("window_mean", "window_coverage"), cube[:2])
+        {name: cube for name in ("avar", "count", "coverage", "edf", "estimator")}
+        | {name: cube[:2] for name in ("window_mean", "window_coverage")},
     )
     units, expected = surface.variables["avar"].attrs.get("units"), VARIABLES["avar"]["units"]
     if units != expected:
@@ -267,10 +265,9 @@ def _check_tau(surface: xr.Dataset) -> None:
 
 def check_coefficients(product: xr.Dataset) -> None:
     """Raise `SchemaError` unless `product` holds the coefficients of every axis and window."""
-    _require_variables(product, "product", {"axis": ("axis",), "time": ("time",)})
-    for name in (f"{term}{end}" for term in TERMS for end in ("", "_stderr", "_upper")):
-        _require_variables(product, "product", {name: ("axis", "time")})
-    _require_variables(product, "product", {"observable": ("axis", "time", "term")})
+    names = [f"{term}{end}" for term in TERMS for end in ("", "_stderr", "_upper")]
+    dims = {"axis": ("axis",), "time": ("time",), **dict.fromkeys(names, ("axis", "time"))}
+    _require_variables(product, "product", {**dims, "observable": ("axis", "time", "term")})
     terms = [str(term) for term in product["term"].values]
     if terms != list(TERMS):
         raise SchemaError(
@@ -284,6 +281,5 @@ def check_product(product: xr.Dataset) -> None:
     """Raise `SchemaError` unless `product` is what `gyrostab.fit_noise` returns."""
     check_surface(product)
     check_coefficients(product)
-    for name in ("fit_tau_min", "filter_time_constant", "filter_white_error"):
-        if name in product:
-            _require_variables(product, "product", {name: ("axis",)})
+    names = ("fit_tau_min", "filter_time_constant", "filter_white_error")
+    _require_variables(product, "product", {name: ("axis",) for name in names if name in product})
