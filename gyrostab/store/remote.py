@@ -210,12 +210,13 @@ def fetch_file(url: str) -> Path:
         if info["type"] == "directory":
             raise FormatError(f"{url}: is a folder, not a Zarr store; name the files in it")
         state = hashlib.sha256(f"{url} {info!r}".encode()).hexdigest()
-        folder = Path(_COPIES.get() or _make_folder_of_process().name, state)
-        target = folder / path.rpartition("/")[2]
+        copies = _COPIES.get() or _make_folder_of_process().name
+        target = Path(copies, state, path.rpartition("/")[2])
         if not target.exists():
-            folder.mkdir(exist_ok=True)
-            filesystem.get_file(path, f"{folder}.part")
-            os.replace(f"{folder}.part", target)
+            part = Path(tempfile.mkdtemp(dir=copies), target.name)  # another thread may do the same
+            filesystem.get_file(path, str(part))
+            target.parent.mkdir(exist_ok=True)
+            os.replace(part, target)
         return target
 
 
