@@ -44,6 +44,7 @@ from gyrostab.jobs.fleet_output import (
 )
 from gyrostab.jobs.fleet_table import (
     FILES,
+    RUNS,
     find_trends,
     is_zarr,
     list_effects,
@@ -53,7 +54,6 @@ from gyrostab.jobs.fleet_table import (
     read_rows,
     read_table,
     summarise_run,
-    write_rows,
     write_table,
 )
 from gyrostab.jobs.job import (
@@ -288,7 +288,7 @@ def _compute_runs(
     work = partial(
         process_run, full_name(target), json.dumps(options, default=str), reports, overwrite
     )
-    done, saved = 0, time.monotonic()
+    done, saved, index = 0, time.monotonic(), target / "index.parquet"
     stage("computing", len(waiting), 0, "runs")
     try:
         with warnings.catch_warnings():
@@ -298,7 +298,7 @@ def _compute_runs(
                 done += 1
                 stage("computing", len(waiting), done, "runs")
                 if time.monotonic() - saved > _SAVE_SECONDS:
-                    write_rows(make_table(rows, runs), target)
+                    write_table(make_table(rows, runs), index, content=RUNS, overwrite=True)
                     saved = time.monotonic()
     except (KeyboardInterrupt, WorkerError) as error:
         reason = str(error) or "interrupted"
@@ -308,7 +308,7 @@ def _compute_runs(
     finally:
         stage("writing", 0)
         table = make_table(rows, runs)
-        write_rows(table, target)
+        write_table(table, index, content=RUNS, overwrite=True)
         _write_overview(table, target)
         if is_zarr(target):
             consolidate_metadata(target, list(rows))

@@ -212,11 +212,6 @@ def make_table(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) ->
     )
 
 
-def write_rows(table: pd.DataFrame, target: Path) -> None:
-    """Write the table of the runs."""
-    write_table(table, target / "index.parquet", content=RUNS, overwrite=True)
-
-
 def list_effects(table: pd.DataFrame) -> pd.DataFrame:
     """List the effects that the diagnoses of runs name.
 

@@ -31,6 +31,7 @@ from gyrostab.store.system import lock_file
 
 _SCHEMA = "gyrostab.job/1"
 _REMOVES_OPEN_FILES = os.name != "nt"
+#: Names of the files of a run; ``log.sha256`` is of an earlier version.
 _JOB_FILE = re.compile(r"lock|job\.json|log\.zarr|log\.sha256|windows-\d{10}\.block")
 _MAX_DIFFERENCES = 4  # differences that a message lists
 

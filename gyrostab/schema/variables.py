@@ -124,22 +124,19 @@ VARIABLES: dict[str, dict[str, Any]] = {
 
 def _add_coefficients() -> None:
     for symbol, law in LAWS.items():
-        extra: dict[str, Any] = {"unit_label": law.label}
+        attrs: dict[str, Any] = {"units": law.units, "unit_label": law.label}
         note = ""
         if law.tau_ref_hours is not None:
-            extra["tau_ref"] = f"{law.tau_ref_hours:g} h"
-            extra["comment"] = f"numerically {symbol} in {law.label}"
+            attrs["tau_ref"] = f"{law.tau_ref_hours:g} h"
+            attrs["comment"] = f"numerically {symbol} in {law.label}"
             note = f", Allan deviation of its term at {law.tau_ref_hours:g} h"
-        base = {"units": law.units, **extra}
-        VARIABLES[symbol] = {"long_name": f"{law.name} coefficient{note}", **base}
-        VARIABLES[f"{symbol}_stderr"] = {
-            "long_name": f"standard error of the {law.name} coefficient{note}",
-            **base,
-        }
-        VARIABLES[f"{symbol}_upper"] = {
-            "long_name": f"95 % upper limit of the {law.name} coefficient{note}",
-            **base,
-        }
+        for end, what in (
+            ("", ""),
+            ("_stderr", "standard error of the "),
+            ("_upper", "95 % upper limit of the "),
+        ):
+            long_name = f"{what}{law.name} coefficient{note}"
+            VARIABLES[f"{symbol}{end}"] = {"long_name": long_name, **attrs}
         if symbol in "NK":
             VARIABLES[f"{symbol}_squared"] = {
                 "long_name": f"square of the {law.name} coefficient",
