@@ -130,12 +130,12 @@ def _add_coefficients() -> None:
             attrs["tau_ref"] = f"{law.tau_ref_hours:g} h"
             attrs["comment"] = f"numerically {symbol} in {law.label}"
             note = f", Allan deviation of its term at {law.tau_ref_hours:g} h"
-        for end, what in (
+        for end, meaning in (
             ("", ""),
             ("_stderr", "standard error of the "),
             ("_upper", "95 % upper limit of the "),
         ):
-            long_name = f"{what}{law.name} coefficient{note}"
+            long_name = f"{meaning}{law.name} coefficient{note}"
             VARIABLES[f"{symbol}{end}"] = {"long_name": long_name, **attrs}
         if symbol in "NK":
             VARIABLES[f"{symbol}_squared"] = {
