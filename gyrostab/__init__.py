@@ -50,8 +50,8 @@ if TYPE_CHECKING:
     from gyrostab.plot import plot_signal as plot_signal
     from gyrostab.plot import save_figures as save_figures
     from gyrostab.report import write_report as write_report
-    from gyrostab.report.diagnosis_folder import open_diagnosis as open_diagnosis
-    from gyrostab.report.diagnosis_folder import write_diagnosis as write_diagnosis
+    from gyrostab.report.diagnosis import open_diagnosis as open_diagnosis
+    from gyrostab.report.diagnosis import write_diagnosis as write_diagnosis
     from gyrostab.simulate import make_noise as make_noise
     from gyrostab.simulate import read_model as read_model
     from gyrostab.simulate import simulate as simulate
@@ -69,7 +69,7 @@ _HOME = {
     "gap_table": "ingest.grid.gaps",
     "make_log": "ingest.make_log",
     "make_noise": "simulate",
-    "open_diagnosis": "report.diagnosis_folder",
+    "open_diagnosis": "report.diagnosis",
     "open_log": "io.opening",
     "open_product": "io.opening",
     "open_surface": "io.opening",
@@ -93,7 +93,7 @@ _HOME = {
     "to_kalibr": "io.kalibr",
     "to_netcdf": "io.datasets",
     "to_zarr": "io.datasets",
-    "write_diagnosis": "report.diagnosis_folder",
+    "write_diagnosis": "report.diagnosis",
     "write_report": "report",
 }
 

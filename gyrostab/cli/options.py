@@ -272,7 +272,7 @@ class Survey:
         """Return the keyword arguments of `gyrostab.to_iscwsa`."""
         options = {name: value for name, value in asdict(self).items() if value is not None}
         if self.diagnosis:
-            from gyrostab.report.diagnosis_folder import open_diagnosis
+            from gyrostab.report.diagnosis import open_diagnosis
 
             options["diagnosis"] = open_diagnosis(self.diagnosis).content
         return options

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
 from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Spool
-from gyrostab.ingest.concat.axes import group_axes, split_axes
-from gyrostab.ingest.concat.channels import check_units
-from gyrostab.ingest.concat.core import absence_notes, merge_notes
+from gyrostab.ingest.concat.core import absence_notes, check_units, merge_notes
+from gyrostab.ingest.concat.grid import group_axes, split_axes
 from gyrostab.ingest.overlap import drop_repeats, first_known_stamp, stamp_span
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import concatenate_columns, make_dask, select_part, stack_rows

@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.stamps import NAT, read_stamps
-from gyrostab.ingest.concat.copies import COMPARED_SAMPLES, match_ends
+from gyrostab.ingest.concat.place import COMPARED_SAMPLES, match_ends
 from gyrostab.store.lazy import read_slice
 
 _BLOCK_ROWS = 2**20

@@ -38,8 +38,8 @@ from gyrostab.simulate.frame import (
 )
 from gyrostab.simulate.model import Model, naming_of, read_model
 from gyrostab.simulate.noise import begin_noise, stream
-from gyrostab.time.clock import time_of_day
 from gyrostab.time.grid import time_coordinate
+from gyrostab.time.stamps import time_of_day
 from gyrostab.units import parse_unit
 
 #: Samples of the instrument in one block of the lazy log.

@@ -23,7 +23,7 @@ from gyrostab.store.output.content import read_json
 from gyrostab.store.private import library_lock
 from gyrostab.store.remote import find_url
 from gyrostab.store.safe_names import is_storable, make_name_storable
-from gyrostab.time.clock import time_of_day
+from gyrostab.time.stamps import time_of_day
 from gyrostab.units import ON_DISK, on_disk
 
 _CONVENTIONS = "CF-1.11, ACDD-1.3"

@@ -15,8 +15,7 @@ import xarray as xr
 import gyrostab
 from gyrostab.cli import main
 from gyrostab.correlate.dataset import join
-from gyrostab.correlate.judge import VERDICTS
-from gyrostab.correlate.table import format_correlation
+from gyrostab.correlate.judge import VERDICTS, format_correlation
 from gyrostab.errors import MissingUnitError, OptionError, TimeError, UnitError
 from gyrostab.kernels.regression.coupling import (
     calibrated,

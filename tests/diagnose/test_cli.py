@@ -22,7 +22,7 @@ from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import to_netcdf
-from gyrostab.report.diagnosis_folder import FILES
+from gyrostab.report.diagnosis import FILES
 from gyrostab.simulate import simulate
 from tests.support.command_line import call
 

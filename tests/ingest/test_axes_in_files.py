@@ -12,7 +12,7 @@ from pyarrow import parquet
 import gyrostab
 from gyrostab.errors import SchemaError, TimeError
 from gyrostab.ingest import ReadOptions, read_log, reading, scan_file
-from gyrostab.ingest.concat.axes import group_axes
+from gyrostab.ingest.concat.grid import group_axes
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.store.lazy import find_source

@@ -1,5 +1,6 @@
 """Samples read without dask equal those of dask, bit for bit."""
 
+import sys
 import warnings
 from itertools import pairwise
 
@@ -15,8 +16,8 @@ from gyrostab.allan.fit import fit_noise, fit_part
 from gyrostab.ingest.columns.pieces import Spool
 from gyrostab.ingest.concat.core import concatenate_logs
 from gyrostab.ingest.concat.lazy import place_on_grid
-from gyrostab.ingest.grid import fill
 from gyrostab.ingest.grid.place import Placement
+from gyrostab.ingest.grid.regularise import rows_on_grid
 from gyrostab.io.opening import open_log
 from gyrostab.jobs import checkpoint
 from gyrostab.jobs.run import load_log, run
@@ -269,7 +270,7 @@ def placed_by_hand(runs, size, rows):
 @pytest.mark.parametrize("storage", ["memory", "disk", "both"])
 @pytest.mark.parametrize(("scale", "unit"), [(1.0, None), (3.0, None), (2.0, 0.1)])
 def test_rows_are_put_on_the_grid_directly_as_by_dask(storage, scale, unit, monkeypatch):
-    monkeypatch.setattr(fill, "MAX_PLAIN_NUMBERS", 10)
+    monkeypatch.setattr(sys.modules["gyrostab.ingest.grid.regularise"], "MAX_PLAIN_NUMBERS", 10)
     rng = np.random.default_rng(8)
     rows = 0.1 * rng.integers(-50, 50, (2, 3000)).astype(float)
     rows[0, 5], rows[1, 1200] = np.inf, np.nan
@@ -295,7 +296,7 @@ def test_rows_are_put_on_the_grid_directly_as_by_dask(storage, scale, unit, monk
         if storage == "memory"
         else stack_rows([concatenate_columns(column, 500) for column in columns])
     )
-    placed = fill.rows_on_grid(
+    placed = rows_on_grid(
         raw, Placement(0, runs, np.empty((0, 5), np.int64)), chunk=512, scale=scale, unit=unit
     )
     assert find_source(placed) is not None

@@ -36,7 +36,7 @@ def report(
     """
     from gyrostab.io.opening import open_log, open_product
     from gyrostab.report import write_diagnosis_report, write_report
-    from gyrostab.report.diagnosis_folder import open_diagnosis
+    from gyrostab.report.diagnosis import open_diagnosis
     from gyrostab.store.output import check_output
 
     target = check_output(output, suffixes=[".html", ".htm"], overwrite=common.overwrite)

@@ -136,7 +136,7 @@ def diagnose(
     from gyrostab.diagnose.core import diagnose as run_diagnosis
     from gyrostab.diagnose.inputs import parse_quiescent_span
     from gyrostab.jobs.run import load_log
-    from gyrostab.report.diagnosis_folder import find_foreign_file, write_diagnosis
+    from gyrostab.report.diagnosis import find_foreign_file, write_diagnosis
     from gyrostab.store.output import check_output
 
     check_output(output, overwrite=common.overwrite, find_foreign=find_foreign_file)

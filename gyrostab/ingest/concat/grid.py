@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from itertools import pairwise
+from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.schema import signal_name
-from gyrostab.store.lazy import read_slice
+from gyrostab.errors import SchemaError
+from gyrostab.ingest.gap_table import (
+    DUPLICATE,
+    END,
+    FIRST,
+    MISSING,
+    clip_table,
+    read_gaps,
+    sort_gaps,
+)
+from gyrostab.schema import signal_name, texts
+from gyrostab.store.lazy import read_slice, select_part, stack_rows
 from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_times
 
 
@@ -125,3 +137,169 @@ def runs_of(first: int, off: float, size: int, ratio: float) -> NDArray[np.int64
     is_nonempty = end > begin
     begin, end = begin[is_nonempty], end[is_nonempty]
     return np.stack([first + begin + shift(begin), begin, end - begin], axis=1)
+
+
+Table = NDArray[np.int64]
+
+_EMPTY: Table = np.empty((0, 5), dtype=np.int64)
+_MAX_SAMPLE = np.iinfo(np.int64).max // 2
+
+
+def _own_gaps(piece: PlacedLog) -> Table:
+    """Return the table of gaps of one log, on the common grid."""
+    table = read_gaps(piece.source.log, piece.source.start, piece.source.rate)
+    if table is None:
+        table = _EMPTY
+    for column in (FIRST, END) if len(table) else ():
+        table[:, column] = piece.on_grid(table[:, column])
+    return np.concatenate([table, _rate_slips(piece)]) if len(piece.runs) > 1 else table
+
+
+def _rate_slips(piece: PlacedLog) -> Table:
+    """Return the samples left empty or dropped where a different rate has drifted by one sample."""
+    end, own_end = piece.runs[:-1, 0] + piece.runs[:-1, 2], piece.runs[:-1, 1] + piece.runs[:-1, 2]
+    start, own_start = piece.runs[1:, 0], piece.runs[1:, 1]
+    cause = np.where(start > end, MISSING, DUPLICATE)
+    return np.stack([end, start, start - end, own_start - own_end, cause], axis=1)
+
+
+def _missing_in_both(held: Table, new: Table) -> Table:
+    """Return the samples missing in both logs, with the causes and the events of the first."""
+    lines = [held[held[:, FIRST] == held[:, END]]]
+    lines += [
+        clip_table(held[held[:, END] > held[:, FIRST]], int(first), int(end))
+        for first, end in new[:, [FIRST, END]]
+        if end > first
+    ]
+    return np.concatenate(lines)
+
+
+def merge_gaps(pieces: Sequence[PlacedLog]) -> Table:
+    """Return the table of gaps of the concatenated log; a gap on some axes counts as a gap.
+
+    Its columns are those of `gyrostab.ingest.gap_table.COLUMNS`, sorted by sample.
+    """
+    groups = group_axes(pieces, [piece.source.axes for piece in pieces])
+    spans = sorted(
+        (min(piece.first for piece in group), max(piece.end for piece in group)) for group in groups
+    )
+    if len(groups) == 1 or any(later[0] >= earlier[1] for earlier, later in pairwise(spans)):
+        # shared axes, or other axes at another time
+        return sort_gaps(_merge_group(pieces, pieces[0].first, None))
+    end = max(end for _, end in spans)
+    tables = [_merge_group(group, spans[0][0], end) for group in groups]
+    return sort_gaps(np.unique(np.concatenate(tables), axis=0))  # a gap of several axes is one line
+
+
+def _merge_group(pieces: Sequence[PlacedLog], begin: int, stop_at: int | None) -> Table:
+    """Return the gaps of logs that share axes, from `begin` on and up to `stop_at` if given."""
+    tables: list[Table] = []
+    firsts: list[int] = []
+    ends: list[int] = []
+    end = begin
+    for piece in pieces:
+        new = _own_gaps(piece)
+        tables.append(new)
+        if piece.first > end:
+            cause = piece.cause if piece.cause >= 0 else MISSING
+            tables[-1] = np.concatenate([[[end, piece.first, piece.first - end, 0, cause]], new])
+        stop = min(piece.end, end)
+        if piece.first < stop:
+            for place in np.flatnonzero((np.array(ends) > piece.first) & (np.array(firsts) < stop)):
+                held = tables[place]
+                inside = _missing_in_both(
+                    clip_table(held, piece.first, stop), clip_table(new, piece.first, stop)
+                )
+                tables[place] = np.concatenate(
+                    [
+                        clip_table(held, -_MAX_SAMPLE, piece.first),
+                        inside,
+                        clip_table(held, stop, _MAX_SAMPLE),
+                    ]
+                )
+            tables[-1] = np.concatenate(
+                [clip_table(new, -_MAX_SAMPLE, piece.first), clip_table(new, stop, _MAX_SAMPLE)]
+            )
+        firsts.append(min(piece.first, end))
+        ends.append(piece.end)
+        end = max(end, piece.end)
+    if stop_at is not None and stop_at > end:
+        tables.append(np.array([[end, stop_at, stop_at - end, 0, MISSING]], dtype=np.int64))
+    return np.concatenate([*tables, _EMPTY])
+
+
+Log = TypeVar("Log")
+
+
+def group_axes(logs: Sequence[Log], axes: Iterable[Sequence[str]]) -> list[list[Log]]:
+    """Group logs by their axes: logs of one group share axes, directly or through other logs.
+
+    The groups are in the order of their first axes.
+
+    Examples
+    --------
+    >>> group_axes("abcd", [["z"], ["x", "y"], ["z"], ["y"]])
+    [['b', 'd'], ['a', 'c']]
+    """
+    groups: list[tuple[set[str], list[int]]] = []
+    for number, log_axes in enumerate(axes):
+        sharing_groups = [group for group in groups if group[0] & set(log_axes)]
+        groups = [group for group in groups if group not in sharing_groups]
+        members = sorted([number, *(member for group in sharing_groups for member in group[1])])
+        groups.append((set(log_axes).union(*(group[0] for group in sharing_groups)), members))
+    ordered = sorted(groups, key=lambda group: sorted(group[0]))
+    return [[logs[number] for number in members] for _, members in ordered]
+
+
+def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
+    """Split a raw log whose groups of axes have separate stamps into one raw log for each group.
+
+    Its attribute ``axis_rows`` lists axes, first row and row after the last of each group.
+    `SchemaError` when rows were selected from the log after it was read.
+    """
+    groups = raw.attrs.get("axis_rows")
+    if groups is None:
+        return [raw]
+    parts = []
+    if int(groups[-1][2]) != raw.sizes["row"]:
+        raise SchemaError(
+            "the rows of this raw log were selected after it was read; regularise the whole, and "
+            "select from the regular log"
+        )
+    name = signal_name(raw)
+    signal, places = raw[name], [str(axis) for axis in raw["axis"].values]
+    files = list(
+        zip(texts(raw, "source_files"), np.atleast_1d(raw.attrs["row_start"]).tolist(), strict=True)
+    )
+    for number, (axes, first, end) in enumerate(groups):
+        rows = [select_part(signal.data, places.index(axis), first, end) for axis in axes]
+        stack = stack_rows(rows)
+        data: dict[Any, Any] = {name: (("axis", "row"), stack, signal.attrs, signal.encoding)}
+        for key, variable in raw.data_vars.items():
+            if key != name and (variable.dims == ("row",) or number == 0):
+                values = (
+                    select_part(variable.data, None, first, end)
+                    if variable.dims == ("row",)
+                    else variable.data
+                )
+                data[key] = (variable.dims, values, variable.attrs, variable.encoding)
+        coords = {
+            str(key): raw[key].variable
+            for key in raw.coords
+            if str(key).startswith("time_") and number == 0
+        }
+        if "time" in raw.variables:
+            coords["time"] = xr.Variable("row", select_part(raw["time"].data, None, first, end))
+        group_files = [(file, start - first) for file, start in files if first <= start < end]
+        attrs = {key: value for key, value in raw.attrs.items() if key != "axis_rows"}
+        attrs |= {
+            "source_files": [file for file, _ in group_files],
+            "row_start": [start for _, start in group_files],
+        }
+        attrs |= (
+            {}
+            if number == 0
+            else {"notes": [], "history": "", "unreadable_rows": 0, "unreadable_cells": 0}
+        )
+        parts.append(xr.Dataset(data, {"axis": axes, **coords}, attrs))
+    return parts

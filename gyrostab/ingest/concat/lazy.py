@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -40,6 +41,29 @@ def place_in_memory(array: NDArray[Any], runs: NDArray[np.int64], size: int) -> 
     samples, rows = (np.repeat(runs[:, column], length) + within for column in (0, 1))
     out[..., samples] = array[..., rows]
     return out
+
+
+def place_array(
+    array: Any,
+    runs: NDArray[np.int64],
+    size: int,
+    chunk: int,
+    *,
+    most_in_memory: int,
+    convert: Callable[[NDArray[np.float64]], None] | None = None,
+) -> Any:
+    """Place one array (..., sample) on a grid: up to so many numbers in memory, else lazily.
+
+    The other parameters are those of `place_on_grid`.
+    """
+    lead = array.shape[:-1]
+    if size * math.prod(lead) <= most_in_memory:
+        out = place_in_memory(np.asarray(array), runs, size)
+        if convert is not None:
+            convert(out)
+        return out
+    placed = [[(array, row if lead else None, runs)] for row in range(math.prod(lead))]
+    return place_on_grid(placed, size, chunk, flat=not lead, convert=convert)
 
 
 class GridSource(RowSource):

@@ -14,7 +14,6 @@ from gyrostab.ingest.gap_table import (
     describe_clock_change,
     format_duration,
 )
-from gyrostab.ingest.grid.fill import samples_of
 from gyrostab.ingest.grid.jitter import MIN_SIGMA
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.rate import RateEstimate
@@ -241,7 +240,7 @@ def describe_placement(
             * (len(twice) > _MANY_SHARE * scanned.rows)
         )
     late = events[events[:, 0] == OUT_OF_ORDER]
-    n_placed = int((samples_of(placement, late[:, 2]) >= 0).sum())
+    n_placed = int((placement.samples_of(late[:, 2]) >= 0).sum())
     if len(late):
         notes.append(
             f"{where}: out of order: {_count_of(len(late), 'row')}, first "

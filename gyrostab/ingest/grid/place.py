@@ -71,6 +71,13 @@ class Placement:
         """Number of rows that have a sample."""
         return int(self.runs[:, 2].sum())
 
+    def samples_of(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the sample of each row, -1 where the row was not placed."""
+        runs = self.runs[np.argsort(self.runs[:, 1], kind="stable")]
+        which = np.searchsorted(runs[:, 1], rows, side="right") - 1
+        inside = (which >= 0) & (rows < runs[which, 1] + runs[which, 2])
+        return np.where(inside, runs[which, 0] + rows - runs[which, 1], -1)
+
     @property
     def has_late_rows(self) -> bool:
         """Whether three consecutive rows were dropped, as happens after a pause."""

@@ -16,15 +16,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
-from gyrostab.ingest.grid.comb import MIN_TICKS, clock_tick, comb_peaks, losses_accumulate
-from gyrostab.ingest.grid.jitter import MIN_SIGMA, JitterModel, fit_jitter, fit_jitter_near
-from gyrostab.ingest.grid.period_fit import fit_pieces, longest_step, pool_pieces
+from gyrostab.ingest.grid.jitter import (
+    MIN_SIGMA,
+    JitterModel,
+    fit_jitter,
+    fit_jitter_near,
+    fit_pieces,
+    longest_step,
+    pool_pieces,
+)
 from gyrostab.ingest.grid.starting_period import (
     LONGEST,
+    MIN_TICKS,
     SECOND,
     SHARED_SHARE,
     Stamps,
+    clock_tick,
+    comb_peaks,
     finer_period,
+    losses_accumulate,
     period_of_lines,
     readable_stamps,
     recut_blocks,

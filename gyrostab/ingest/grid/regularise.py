@@ -7,32 +7,39 @@ file, bit for bit, or NaN.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
+import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from gyrostab.ingest.concat.axes import split_axes
+from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.concat.core import concatenate_logs
+from gyrostab.ingest.concat.grid import split_axes
+from gyrostab.ingest.concat.lazy import place_array
 from gyrostab.ingest.gap_table import gap_variables, name_lost, sort_gaps
-from gyrostab.ingest.grid.fill import count_placed, gather_channel, rows_on_grid
 from gyrostab.ingest.grid.gaps import find_gaps
 from gyrostab.ingest.grid.notes import describe_angles, describe_channels, describe_placement
 from gyrostab.ingest.grid.place import Placement, check_grid
 from gyrostab.ingest.grid.place_rows import RowPlacer
-from gyrostab.ingest.grid.scan_pass import ScanPass, file_of, scan_rows
+from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, scan_rows
 from gyrostab.ingest.limits import check_limits
 from gyrostab.ingest.uniform import as_uniform, check_same_rate
+from gyrostab.kernels.grid.stamps import NO_STAMP, RESTART, STEP
 from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts
+from gyrostab.store.lazy import read_slice
 from gyrostab.store.write import chunk_samples
-from gyrostab.time.clock import extend_history
 from gyrostab.time.durations import duration_seconds
-from gyrostab.time.grid import check_rate, check_span, first_stamp, time_coordinate
-from gyrostab.time.stamps import format_stamp
+from gyrostab.time.grid import check_rate, check_span, first_stamp, grid_times, time_coordinate
+from gyrostab.time.stamps import extend_history, format_stamp
 from gyrostab.units import HOUR
 from gyrostab.wording import list_some
 
 # Share of the values of a channel that may be lost with rows that have no sample.
 _MAX_UNPLACED_SHARE = 0.1
+#: Largest array that is held in memory instead of being computed when needed [numbers].
+MAX_PLAIN_NUMBERS = 2_000_000
 _OWN_ATTRIBUTES = (
     "declared_rate_hz",
     "start",
@@ -238,3 +245,70 @@ def regularise(
     if placement.rate_changes:
         log.attrs["rate_changes"] = list(map(format_stamp, placement.rate_changes))
     return log.assign_attrs(notes=[*log.attrs["notes"], *describe_channels(log)])
+
+
+def _scale_samples(out: NDArray[np.float64], *, scale: float, unit: float | None) -> None:
+    """Scale samples in place, and set infinite ones to NaN."""
+    out[np.isinf(out)] = np.nan
+    if scale != 1.0:
+        out[...] = out * scale if unit is None else np.rint(out / unit) * (unit * scale)
+
+
+def rows_on_grid(
+    rows: Any, placement: Placement, *, chunk: int, scale: float = 1.0, unit: float | None = None
+) -> Any:
+    """Convert an array by row to an array by sample, float64, NaN where missing or infinite.
+
+    If the values are whole multiples of `unit`, the result has exact whole multiples of ``unit *
+    scale``. A small result is a numpy array; chunks of others without any sample take no memory
+    until they are computed.
+    """
+    return place_array(
+        rows,
+        placement.runs,
+        placement.size,
+        chunk,
+        most_in_memory=MAX_PLAIN_NUMBERS,
+        convert=partial(_scale_samples, scale=scale, unit=unit),
+    )
+
+
+def count_placed(channel: Any, placement: Placement) -> int:
+    """Count the rows with a sample in which a channel has a value."""
+    count = 0
+    for begin in range(0, channel.shape[0], BLOCK_ROWS):
+        end = min(begin + BLOCK_ROWS, channel.shape[0])
+        rows = np.flatnonzero(np.isfinite(read_slice(channel, begin, end))) + begin
+        count += int(np.count_nonzero(placement.samples_of(rows) >= 0))
+    return count
+
+
+def gather_channel(
+    raw: xr.Dataset, name: str, placement: Placement, rate: float
+) -> tuple[NDArray[np.datetime64], NDArray[np.float64]]:
+    """Return stamps and values of the filled rows of a slow channel."""
+    channel = raw[name].data
+    breaks = placement.events[np.isin(placement.events[:, 0], (STEP, RESTART))]
+    breaks = breaks[np.argsort(breaks[:, 2], kind="stable")]
+    moved = np.concatenate(
+        [[0], grid_times(placement.start, rate, breaks[:, 1] + 1) - breaks[:, 4]]
+    )
+    stamps, values = [], []
+    for begin in range(0, channel.shape[0], BLOCK_ROWS):
+        end = min(begin + BLOCK_ROWS, channel.shape[0])
+        block = read_slice(channel, begin, end).astype(np.float64, copy=False)
+        rows = np.flatnonzero(np.isfinite(block))
+        sample = placement.samples_of(rows + begin)
+        has_time = sample >= 0
+        when = grid_times(placement.start, rate, sample)
+        if "time" in raw.variables and not has_time.all():
+            written = read_stamps(raw, begin, end)[rows]
+            moved_stamps = (
+                written + moved[np.searchsorted(breaks[:, 2], rows + begin, side="right")]
+            )
+            when = np.where(has_time, when, moved_stamps)
+            has_time |= written != NO_STAMP
+        stamps.append(when[has_time])
+        values.append(block[rows][has_time])
+    time, first = np.unique(np.concatenate(stamps), return_index=True)
+    return time.view("datetime64[ns]"), np.concatenate(values)[first]

@@ -10,6 +10,27 @@ from numpy.typing import NDArray
 from gyrostab.kernels.grid.stamps import NO_STAMP, track
 
 SECOND = 1e9
+_STRETCH = 8192  # longest sampled stretch [stamps]
+_MAX_STRETCHES = 128
+_PATTERN = 8  # longest pattern of steps [steps]
+_ROWS = 17  # further rows in which a pattern must recur
+_WHOLE = 0.15  # largest distance of a step of a pattern from whole samples [samples]
+LONGEST = 5.0  # longest step of a pattern [samples]
+TRACK_GAIN = 0.1  # with which the phase follows stamps near multiples of the period
+#: Smallest share of rows with the stamp of the previous row if stamps are shared.
+SHARED_SHARE = 0.05
+
+#: Bins of a stretch, bins in the shortest period, and stretches that are used at most.
+_BINS, _BINS_PER_PERIOD, _MAX_TABLES = 1 << 15, 4, 64
+_MAX_PEAKS = 3
+#: Shortest period [ticks of the clock]: of a tick all stamps are multiples, however sampled. The
+#: longest tick [ns] that is certainly one, as in stamps in milliseconds.
+MIN_TICKS, _COMMON_TICK = 1.5, 1e6
+_PEAK_WIDTH = 0.02  # relative distance of two peaks, at least
+
+#: Rows over which random losses accumulate, at least and at most, and the share of the variance of
+#: independent steps below which they do not.
+_MIN_SPAN_ROWS, _SPAN_ROWS, _MIN_ACCUMULATION = 16, 256, 0.2
 
 #: Returns a new iterator over all blocks of row numbers and stamps at each call.
 Stamps = Callable[[], Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]]
@@ -56,10 +77,6 @@ def readable_stamps(block: NDArray[np.int64]) -> NDArray[np.int64]:
     return block if is_readable.all() else block[is_readable]
 
 
-_STRETCH = 8192  # longest sampled stretch [stamps]
-_MAX_STRETCHES = 128
-
-
 def sample_stretches(stamps: Stamps) -> list[NDArray[np.int64]]:
     """Return stretches of stamps from the whole log, a few hundred thousand in all.
 
@@ -76,12 +93,6 @@ def sample_stretches(stamps: Stamps) -> list[NDArray[np.int64]]:
             if len(stretches) > _MAX_STRETCHES:
                 stretches, stride = stretches[::2], 2 * stride
     return [part for part in stretches if np.count_nonzero(part != NO_STAMP) > 1]
-
-
-_PATTERN = 8  # longest pattern of steps [steps]
-_ROWS = 17  # further rows in which a pattern must recur
-_WHOLE = 0.15  # largest distance of a step of a pattern from whole samples [samples]
-LONGEST = 5.0  # longest step of a pattern [samples]
 
 
 def cut_stretches(parts: list[NDArray[np.int64]], length: int) -> NDArray[np.float64]:
@@ -134,13 +145,6 @@ def finer_period(parts: list[NDArray[np.int64]], period: float) -> float | None:
     return single if (is_whole & np.any(recurrences, axis=0) & uneven).mean() > 0.5 else None
 
 
-GAIN = 0.1
-
-SHARED_SHARE = (
-    0.05  # smallest share of rows with the stamp of the previous row if stamps are shared
-)
-
-
 def _residual_range(
     parts: list[NDArray[np.int64]], length: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -183,7 +187,7 @@ def period_of_lines(parts: list[NDArray[np.int64]]) -> float | None:
     if length < 12 or good.sum() < max(1, 0.03 * len(slope)):
         return None
     period = float(np.median(slope[good]))
-    for gain in (0.5, 0.5, 0.2, 0.1, GAIN):
+    for gain in (0.5, 0.5, 0.2, 0.1, TRACK_GAIN):
         time = samples = 0
         for part in parts:
             count, piece = track(part, period, gain, 20 * period)
@@ -234,14 +238,8 @@ def _is_bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], perio
         return False
     if abs(np.exp(2j * np.pi * long / period).mean()) < 0.2:
         return True
-    length = min(256, len(steps) // 16)
-    if np.median(long) < 3 * period or length < 16:
-        return False
-    spans = np.concatenate(
-        [(part[length:] - part[:-length])[::length] for part in parts if len(part) > length]
-    ).astype(np.float64)
-    scatter = 1.4826 * np.median(np.abs(spans - np.median(spans)))
-    return bool(scatter**2 < 0.2 * length * inliers.var())  # random losses would accumulate
+    is_long = len(steps) >= 16 * _MIN_SPAN_ROWS and np.median(long) >= 3 * period
+    return bool(is_long) and not losses_accumulate(parts)
 
 
 def time_per_row(stretches: list[NDArray[np.int64]], *, ticks: bool = False) -> float:
@@ -277,3 +275,73 @@ def _tick_steps(steps: NDArray[np.float64], rows: NDArray[np.int64]) -> tuple[fl
     paces = times / counts
     good = paces <= 3 * np.median(np.repeat(paces, counts))
     return float(times[good].sum()), int(counts[good].sum())
+
+
+def losses_accumulate(parts: list[NDArray[np.int64]]) -> bool:
+    """Return whether the time of many rows varies as much as independent steps make it vary.
+
+    It does if samples are lost at random; pauses between packets of rows do not change the number
+    of rows in a long time.
+    """
+    steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
+    length = min(_SPAN_ROWS, len(steps) // 16)
+    if length < _MIN_SPAN_ROWS:
+        return False
+    spans = np.concatenate(
+        [(part[length:] - part[:-length])[::length] for part in parts if len(part) > length]
+    ).astype(np.float64)
+    usual = steps[np.abs(steps) < 50 * np.median(steps[steps > 0])]
+    scatter = 1.4826 * np.median(np.abs(spans - np.median(spans)))
+    return bool(scatter**2 >= _MIN_ACCUMULATION * length * usual.var())
+
+
+def clock_tick(parts: list[NDArray[np.int64]]) -> float:
+    """Return the largest time [ns] of which all stamps are multiples, from the first on."""
+    return float(np.gcd.reduce(np.concatenate([np.diff(part) for part in parts])))
+
+
+def comb_peaks(parts: list[NDArray[np.int64]]) -> list[tuple[float, float]]:
+    """Return periods [ns] near multiples of which the stamps lie, and the jitter [samples].
+
+    The power of N stamps at the sampling frequency is 1 + N exp(-4 pi^2 sigma^2) for a jitter of
+    sigma samples, whichever samples are missing.
+    """
+    steps = np.concatenate([np.diff(part) for part in parts])
+    steps = steps[steps > 0]
+    tick = min(clock_tick(parts), _COMMON_TICK)
+    shortest = max(0.7 * float(np.quantile(steps, 0.1)), MIN_TICKS * tick)
+    longest = 1.1 * float(np.mean(steps[steps <= 50 * np.median(steps)]))
+    width = shortest / _BINS_PER_PERIOD
+    counts = [
+        table
+        for part in parts
+        for table in _count_stamps(((part - part.min()) / width).astype(np.int64))
+    ]
+    counts = counts[:: -(-len(counts) // _MAX_TABLES)]
+    rows = np.array([table.sum() for table in counts])
+    power = sum(np.abs(np.fft.rfft(table - table.mean())) ** 2 for table in counts) / rows.sum()
+    frequency = np.fft.rfftfreq(_BINS, width)
+    inside = (frequency > 1 / longest) & (frequency < 1 / shortest)
+    frequency, power = frequency[inside], power[inside]
+    peaks: list[tuple[float, float]] = []
+    level = 1 + 7 / np.sqrt(len(counts)) + 16 / len(counts)  # 1e-6 of chance
+    while len(power) and len(peaks) < _MAX_PEAKS:
+        best = int(np.argmax(power))
+        excess = power[best] / np.median(power)
+        if excess < level:
+            break
+        coherence = min(0.99, power[best] * rows.sum() / (rows**2).sum())
+        peaks.append((1 / frequency[best], float(np.sqrt(-np.log(coherence)) / (2 * np.pi))))
+        apart = np.abs(frequency / frequency[best] - 1) > _PEAK_WIDTH
+        frequency, power = frequency[apart], power[apart]
+    return peaks
+
+
+def _count_stamps(bins: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+    """Count the stamps in each bin, in stretches of `_BINS` bins that hold at least 64 stamps."""
+    stretch = bins // _BINS
+    numbers, rows = np.unique(stretch, return_counts=True)
+    return [
+        np.bincount(bins[stretch == number] % _BINS, minlength=_BINS).astype(np.float64)
+        for number in numbers[rows >= min(64, rows.max())]
+    ]

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.ingest.concat.lazy import chunk_of, place_in_memory, place_on_grid
+from gyrostab.ingest.concat.lazy import chunk_of, place_array
 from gyrostab.ingest.gap_table import (
     END,
     FIRST,
@@ -197,7 +197,14 @@ def place_samples(log: xr.Dataset, runs: Runs, start: int, rate: float, size: in
             left_out.append(str(name))
             continue
         turned = variable.transpose(..., "time")
-        array = _place_array(turned.data, runs, size)
+        in_memory = isinstance(turned.data, np.ndarray)
+        array = place_array(
+            turned.data,
+            runs,
+            size,
+            chunk=CHUNK_SAMPLES if in_memory else chunk_of([turned.data]),
+            most_in_memory=max(SMALL_SIZE, 2 * variable.size) if in_memory else 0,
+        )
         placed[name] = xr.Variable(turned.dims, array, variable.attrs, variable.encoding).transpose(
             *variable.dims
         )
@@ -210,15 +217,6 @@ def place_samples(log: xr.Dataset, runs: Runs, start: int, rate: float, size: in
         note = f"left out, as missing samples of it could not be marked: {', '.join(left_out)}"
         placed_log = placed_log.assign_attrs(notes=[*texts(log, "notes"), note])
     return placed_log
-
-
-def _place_array(array: Any, runs: Runs, size: int) -> Any:
-    lead = int(np.prod(array.shape[:-1], dtype=np.int64))
-    if isinstance(array, np.ndarray) and size * lead <= max(SMALL_SIZE, 2 * array.size):
-        return place_in_memory(array, runs, size)
-    chunk = CHUNK_SAMPLES if isinstance(array, np.ndarray) else chunk_of([array])
-    rows = [None] if array.ndim == 1 else range(array.shape[0])
-    return place_on_grid([[(array, row, runs)] for row in rows], size, chunk, flat=array.ndim == 1)
 
 
 Table = NDArray[np.int64]

@@ -22,10 +22,9 @@ from gyrostab.ingest.uniform.core import (
 )
 from gyrostab.ingest.uniform.grid import UniformGrid
 from gyrostab.schema import check_log
-from gyrostab.time.clock import extend_history
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import grid_index, grid_times
-from gyrostab.time.stamps import stamp_ns, to_nanoseconds
+from gyrostab.time.stamps import extend_history, stamp_ns, to_nanoseconds
 
 _EXAMPLE = "2026-11-20T14:00 (UTC) or 10min after the start"
 _SPAN_EXAMPLE = "2026-11-20T14:00/2026-11-20T14:05 or 10min/15min after the start"

@@ -32,7 +32,7 @@ from gyrostab.diagnose.result.text import (
 from gyrostab.errors import FormatError, OutputError, SchemaError
 from gyrostab.physics.registry import effects, make_effect
 from gyrostab.report import write_diagnosis_report
-from gyrostab.report.diagnosis_folder import FILES, open_diagnosis, write_diagnosis
+from gyrostab.report.diagnosis import FILES, open_diagnosis, write_diagnosis
 from gyrostab.simulate import read_model, simulate
 from tests.support.command_line import call
 from tests.support.diagnosed import content, diagnosis, model, surfaces
@@ -270,7 +270,7 @@ def test_interrupted_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytest.
     def fail(*_: Any, **__: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("gyrostab.report.diagnosis_folder.to_netcdf", fail)
+    monkeypatch.setattr("gyrostab.report.diagnosis.to_netcdf", fail)
     with pytest.raises(OutputError):
         write_diagnosis(diagnosis(), tmp_path / "found")
     assert list(tmp_path.iterdir()) == []

@@ -14,10 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.errors import FormatError, OptionError, TimeError
-from gyrostab.ingest.grid.fill import rows_on_grid
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.place import place_by_stamp
-from gyrostab.ingest.grid.regularise import regularise
+from gyrostab.ingest.grid.regularise import regularise, rows_on_grid
 from gyrostab.ingest.reading import read_log
 from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import check_log
@@ -128,7 +127,7 @@ def test_lazy_arrays_equal_those_in_memory(chunk, monkeypatch):
     raw = raw_log(stamps_of(samples, 300.0), values)
     truth = np.full((2, samples[-1] + 1), np.nan)
     truth[:, samples] = values
-    monkeypatch.setattr(sys.modules["gyrostab.ingest.grid.fill"], "MAX_PLAIN_NUMBERS", 10)
+    monkeypatch.setattr(sys.modules["gyrostab.ingest.grid.regularise"], "MAX_PLAIN_NUMBERS", 10)
     for signal in (values, da.from_array(values, chunks=(1, 247))):
         log = regularise_in_parts(raw.assign(rate=raw.rate.copy(data=signal)), chunk=chunk)
         assert isinstance(log.rate.data, da.Array)

@@ -90,7 +90,7 @@ def test_few_rows_are_compared_at_each_of_many_restarts(monkeypatch):
         rows_read.append(end - begin)
         return read_stamps(raw, begin, end)
 
-    monkeypatch.setattr("gyrostab.ingest.grid.repeats.read_stamps", count_rows)
+    monkeypatch.setattr("gyrostab.ingest.grid.place_rows.read_stamps", count_rows)
     n = 20_000
     values = np.random.default_rng(0).standard_normal(n)
     log = regularise(raw_log(START + np.arange(n) % 100 * 10_000_000, values))
