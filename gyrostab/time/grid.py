@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from datetime import date
 from fractions import Fraction
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -126,67 +127,42 @@ def first_stamp(log: xr.Dataset) -> int:
 
 
 class _GridTransform(CoordinateTransform):
-    """Transform from position to stamp, for sample ``first + stride * position`` of a grid."""
+    """Transform from position to stamp, for some evenly spaced `samples` of a grid."""
 
-    def __init__(
-        self,
-        start: int,
-        rate: float,
-        size: int,
-        *,
-        first: int = 0,
-        stride: int = 1,
-        name: str = "time",
-        dim: str = "time",
-    ):
-        super().__init__([name], {dim: size}, dtype=np.dtype("datetime64[ns]"))
-        self.start, self.rate = int(start), float(rate)
-        self.first, self.stride = int(first), int(stride)
+    def __init__(self, start: int, rate: float, samples: range, name: str):
+        super().__init__([name], {name: len(samples)}, dtype=np.dtype("datetime64[ns]"))
+        self.start, self.rate, self.samples = int(start), float(rate), samples
 
     @property
     def size(self) -> int:
-        return int(next(iter(self.dim_size.values())))
+        return len(self.samples)
 
     def forward(self, dim_positions: dict[str, Any]) -> dict[Any, Any]:
         position = np.asarray(dim_positions[self.dims[0]], dtype=np.int64)
-        stamps = grid_times(self.start, self.rate, self.first + self.stride * position)
+        sample = self.samples.start + self.samples.step * position
+        stamps = grid_times(self.start, self.rate, sample)
         return {self.coord_names[0]: stamps.view("datetime64[ns]")}
 
     def reverse(self, coord_labels: dict[Any, Any]) -> dict[str, Any]:
         stamps = to_nanoseconds(coord_labels[self.coord_names[0]])
-        return {
-            self.dims[0]: (grid_index(self.start, self.rate, stamps) - self.first) / self.stride
-        }
+        sample = grid_index(self.start, self.rate, stamps)
+        return {self.dims[0]: (sample - self.samples.start) / self.samples.step}
 
     def equals(self, other: CoordinateTransform, *, exclude: frozenset[Any] | None = None) -> bool:
-        return isinstance(other, _GridTransform) and self._key() == other._key()
-
-    def _key(self) -> tuple[Any, ...]:
-        return (self.start, self.rate, self.first, self.stride, self.size)
-
-    def select(self, positions: range) -> _GridTransform:
-        """Return the samples at these positions, also beyond the end."""
-        first, stride = self.first + self.stride * positions.start, self.stride * positions.step
-        return _GridTransform(
-            self.start,
-            self.rate,
-            len(positions),
-            first=first,
-            stride=stride,
-            name=str(self.coord_names[0]),
-            dim=self.dims[0],
+        return isinstance(other, _GridTransform) and (self.start, self.rate, self.samples) == (
+            other.start,
+            other.rate,
+            other.samples,
         )
 
-    def cut(self, part: slice) -> _GridTransform:
-        return self.select(range(self.size)[part])
+    def select(self, samples: range) -> _GridTransform:
+        """Return other samples of the same grid."""
+        return _GridTransform(self.start, self.rate, samples, self.dims[0])
 
-    def has_ends_of(self, other: _GridTransform) -> bool:
-        """Whether another grid of the same size has the same first and last stamp."""
+    def end_stamps(self) -> NDArray[Any]:
+        """Return the first and last stamp; two equal ones if there is none in between."""
         ends = {self.dims[0]: np.array([0, max(self.size - 1, 0)])}
-        own_stamps, other_stamps = (
-            grid.forward(ends)[grid.coord_names[0]] for grid in (self, other)
-        )
-        return bool(np.array_equal(own_stamps, other_stamps))
+        return np.asarray(self.forward(ends)[self.coord_names[0]])
 
 
 def _span_of(bound: Any) -> tuple[np.datetime64, np.datetime64]:
@@ -216,44 +192,56 @@ class TimeGridIndex(CoordinateTransformIndex):
     @property
     def start(self) -> int:
         """Stamp of the first sample [ns since 1970]."""
-        return int(grid_times(self.transform.start, self.transform.rate, self.transform.first))
+        return int(
+            grid_times(self.transform.start, self.transform.rate, self.transform.samples.start)
+        )
 
     @property
     def rate(self) -> float:
         """Sampling rate [Hz]."""
-        return self.transform.rate / self.transform.stride
+        return self.transform.rate / self.transform.samples.step
 
     def isel(self, indexers: Mapping[Any, Any]) -> TimeGridIndex | None:
         """Keep the index for slices forward; other selections get an ordinary coordinate."""
         part = indexers[self.transform.dims[0]]
         is_forward = isinstance(part, slice) and (part.step is None or part.step > 0)
-        return type(self)(self.transform.cut(part)) if is_forward else None
+        if not is_forward:
+            return None
+        return type(self)(self.transform.select(self.transform.samples[part]))
 
     @classmethod
     def concat(cls, indexes: Sequence[Any], dim: Any, positions: Any = None) -> Any:
         """Concatenate axes; the result is computed if each begins where the previous one ends."""
         if positions is None and all(isinstance(index, cls) for index in indexes):
             grids = [index.transform for index in indexes]
-            full_grid, at, fits = grids[0].select(range(sum(grid.size for grid in grids))), 0, True
-            for grid in grids:
-                fits = fits and full_grid.cut(slice(at, at + grid.size)).has_ends_of(grid)
-                at += grid.size
-            if fits:
-                return cls(full_grid)
+            edges = np.cumsum([0, *(grid.size for grid in grids)]).tolist()
+            first, step = grids[0].samples.start, grids[0].samples.step
+            joined = [
+                grids[0].select(range(first + step * begin, first + step * end, step))
+                for begin, end in [*pairwise(edges), (0, edges[-1])]
+            ]
+            if all(
+                np.array_equal(part.end_stamps(), grid.end_stamps())
+                for part, grid in zip(joined, grids, strict=False)
+            ):
+                return cls(joined[-1])
         stamps = [index.to_pandas_index() for index in indexes]
         return xr.indexes.PandasIndex(stamps[0].append(stamps[1:]), dim)
 
     def join(self, other: Any, how: str = "inner") -> Any:
         """Return the common or united axis; it is computed if both are parts of one grid."""
         own, another = self.transform, other.transform
-        shift, rest = divmod(another.first - own.first, own.stride)
-        grids = [(grid.start, grid.rate, grid.stride) for grid in (own, another)]
-        if not rest and grids[0] == grids[1]:
-            begins, ends = (0, shift), (own.size, shift + another.size)
+        grids = [(grid.start, grid.rate, grid.samples.step) for grid in (own, another)]
+        starts = own.samples.start, another.samples.start
+        step = own.samples.step
+        if grids[0] == grids[1] and (starts[1] - starts[0]) % step == 0:
+            stops = [
+                begin + step * grid.size for begin, grid in zip(starts, (own, another), strict=True)
+            ]
             if how == "inner":
-                return type(self)(own.select(range(max(begins), min(ends))))
-            if max(begins) <= min(ends):
-                return type(self)(own.select(range(min(begins), max(ends))))
+                return type(self)(own.select(range(max(starts), min(stops), step)))
+            if max(starts) <= min(stops):
+                return type(self)(own.select(range(min(starts), max(stops), step)))
         stamps = self.to_pandas_index(), other.to_pandas_index()
         joined = stamps[0].union(stamps[1]) if how == "outer" else stamps[0].intersection(stamps[1])
         return xr.indexes.PandasIndex(joined, own.dims[0])
@@ -345,9 +333,7 @@ class TimeGridIndex(CoordinateTransformIndex):
         )
 
 
-def time_coordinate(
-    start: int, rate: float, size: int, *, name: str = "time", first: int = 0, stride: int = 1
-) -> xr.Coordinates:
+def time_coordinate(start: int, rate: float, size: int, *, name: str = "time") -> xr.Coordinates:
     """Lazy, exact, uniform time coordinate.
 
     Parameters
@@ -360,9 +346,6 @@ def time_coordinate(
         Number of samples on the axis.
     name : str
         Name of the coordinate and of its dimension.
-    first, stride : int
-        The axis holds the samples `first`, ``first + stride``, ... of the grid that begins at
-        `start`.
 
     Returns
     -------
@@ -378,8 +361,4 @@ def time_coordinate(
     array(['1970-01-01T00:00:00.000000000', '1970-01-01T00:00:00.005000000'],
           dtype='datetime64[ns]')
     """
-    return xr.Coordinates.from_xindex(
-        TimeGridIndex(
-            _GridTransform(start, rate, size, first=first, stride=stride, name=name, dim=name)
-        )
-    )
+    return xr.Coordinates.from_xindex(TimeGridIndex(_GridTransform(start, rate, range(size), name)))
