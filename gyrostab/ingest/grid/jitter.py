@@ -13,14 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.ingest.grid.starting_period import SECOND, TRACK_GAIN, Stamps, readable_stamps
+from gyrostab.ingest.grid.starting_period import (
+    SECOND,
+    TRACK_GAIN,
+    Block,
+    Integers,
+    Parts,
+    Stamps,
+    readable_stamps,
+)
 from gyrostab.kernels.grid.course import LOSS_NATS, follow
 from gyrostab.kernels.grid.stamps import NO_STAMP, piece_sums, track
 from gyrostab.store.threads import map_in_order
-
-Integers = NDArray[np.int64]
-
-ObservedStamps = tuple[Integers, Integers]
 
 #: Smallest standard deviation of the jitter that is passed to the kernel [samples].
 MIN_SIGMA = 0.1
@@ -87,7 +91,7 @@ def observe_rows(stamps: Integers, observe: str, period: float) -> Integers:
 
 
 def fit_jitter(
-    parts: list[Integers], guesses: list[tuple[float, float]], observe: str, *, sure: float
+    parts: Parts, guesses: list[tuple[float, float]], observe: str, *, sure: float
 ) -> JitterModel | None:
     """Fit the sampling period that explains stretches of stamps best, with lost samples.
 
@@ -116,7 +120,7 @@ def fit_jitter(
 
 
 def _start_on_lines(
-    observed: list[ObservedStamps], observe: str, group: float, sure: float
+    observed: list[Block], observe: str, group: float, sure: float
 ) -> list[tuple[float, float]]:
     """Return the best periods [ns] near the slopes of stretches, and their jitter [samples]."""
     lengths = (
@@ -139,7 +143,7 @@ def _start_on_lines(
 
 
 def fit_jitter_near(
-    parts: list[Integers], period: float, observe: str, *, sure: float
+    parts: Parts, period: float, observe: str, *, sure: float
 ) -> JitterModel | None:
     """Fit the jitter model near a given period [ns]; None if the stamps do not fit it."""
     observed = _observe_parts(parts, observe, period)
@@ -153,7 +157,7 @@ def fit_jitter_near(
     return model if model is not None and model.fits else None
 
 
-def _rows_per_group(observed: list[ObservedStamps]) -> float:
+def _rows_per_group(observed: list[Block]) -> float:
     """Return the mean number of rows for each used stamp."""
     return float(
         sum(count[-1] - count[0] for count, _ in observed)
@@ -161,7 +165,7 @@ def _rows_per_group(observed: list[ObservedStamps]) -> float:
     )
 
 
-def _observe_parts(parts: list[Integers], observe: str, period: float) -> list[ObservedStamps]:
+def _observe_parts(parts: Parts, observe: str, period: float) -> list[Block]:
     observed = []
     for part in parts:
         rows = observe_rows(part, observe, period)[1:-1]
@@ -171,7 +175,7 @@ def _observe_parts(parts: list[Integers], observe: str, period: float) -> list[O
 
 
 def _fit_lines(
-    observed: list[ObservedStamps], length: int
+    observed: list[Block], length: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Fit lines to stretches of `length` stamps: slopes [ns a row], residual sigma [ns]."""
     tables = []
@@ -195,7 +199,7 @@ def _fit_lines(
 
 
 def _candidate_periods(
-    observed: list[ObservedStamps], slope: NDArray[np.float64], group: float
+    observed: list[Block], slope: NDArray[np.float64], group: float
 ) -> list[float]:
     """Return candidate periods [ns] near the smaller slopes; losses increase slopes."""
     longer = _fit_lines(observed, 128)
@@ -209,7 +213,7 @@ def _candidate_periods(
     return [float(period) for period in np.geomspace(low, high, steps)]
 
 
-def _row_cost(observed: list[ObservedStamps], period: float, sigma_ns: float, sure: float) -> float:
+def _row_cost(observed: list[Block], period: float, sigma_ns: float, sure: float) -> float:
     """Return the mean cost of a row [nats] for a period [ns]."""
     sigma = max(sigma_ns / period, MIN_SIGMA)
     total = sum(
@@ -220,7 +224,7 @@ def _row_cost(observed: list[ObservedStamps], period: float, sigma_ns: float, su
 
 
 def _refine_model(
-    observed: list[ObservedStamps], jitter: JitterModel, sure: float, *, most_off: float = 0.05
+    observed: list[Block], jitter: JitterModel, sure: float, *, most_off: float = 0.05
 ) -> JitterModel | None:
     """Refine period and jitter along the sequence of samples; None if the fit fails."""
     if not observed:
@@ -308,7 +312,7 @@ def count_samples(
     return stamps[at][is_near], sample[is_near], piece[is_near]
 
 
-def longest_step(parts: list[NDArray[np.int64]], period: float) -> float:
+def longest_step(parts: Parts, period: float) -> float:
     """Return the step [ns] after which counting restarts when rows are placed by count."""
     steps = np.concatenate([np.diff(part) for part in parts])
     return float(max(SECOND, 50 * period, 10 * np.quantile(np.abs(steps), 0.99)))
@@ -325,7 +329,7 @@ def fit_pieces(
     """Sum each unbroken piece: n, mean count, mean stamp [ns], cc, ct, squared residuals."""
 
     def sum_block(
-        block: tuple[NDArray[np.int64], NDArray[np.int64]],
+        block: Block,
     ) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
         """Return first stamp, reference stamp and sums of the pieces of a block."""
         values = block[1]

@@ -16,7 +16,7 @@ from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.gap_table import format_duration, is_restart
 from gyrostab.ingest.grid.rate import RateEstimate
 from gyrostab.ingest.grid.scan_pass import file_of
-from gyrostab.ingest.grid.starting_period import Stamps, readable_stamps, recut_blocks
+from gyrostab.ingest.grid.starting_period import Integers, Stamps, readable_stamps, recut_blocks
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.kernels.grid import stamps as kernel
 from gyrostab.kernels.grid.stamps import (
@@ -52,10 +52,10 @@ class Placement:
 
     start: int  # stamp of sample 0 [ns since 1970]
     #: (n, 3): first sample, first row, length; sorted by sample, without overlap.
-    runs: NDArray[np.int64]
+    runs: Integers
     #: (n, 5): cause (number in schema.GAP_CAUSES), sample, row, stamp before [ns], stamp [ns];
     #: sorted by sample.
-    events: NDArray[np.int64]
+    events: Integers
     #: Largest distance of the smoothed stamps from the grid [samples]; only for counted rows.
     wander: float = 0.0
     #: Stamps from which the rate of the rows deviates from that of the grid [ns since 1970].
@@ -71,7 +71,7 @@ class Placement:
         """Number of rows that have a sample."""
         return int(self.runs[:, 2].sum())
 
-    def samples_of(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    def samples_of(self, rows: Integers) -> Integers:
         """Return the sample of each row, -1 where the row was not placed."""
         runs = self.runs[np.argsort(self.runs[:, 1], kind="stable")]
         which = np.searchsorted(runs[:, 1], rows, side="right") - 1
@@ -86,7 +86,7 @@ class Placement:
 
 
 def make_placement(
-    start: int, runs: list[NDArray[np.int64]], events: list[NDArray[np.int64]], wander: float = 0.0
+    start: int, runs: list[Integers], events: list[Integers], wander: float = 0.0
 ) -> Placement:
     """Make a placement of lists of runs and events, sorted by sample."""
     table = np.concatenate(runs)
@@ -129,9 +129,7 @@ def check_grid(
     )
 
 
-def append_runs(
-    runs: list[NDArray[np.int64]], sample: NDArray[np.int64], rows: NDArray[np.int64]
-) -> None:
+def append_runs(runs: list[Integers], sample: Integers, rows: Integers) -> None:
     """Append runs of rows and samples to `runs`; extend the last run if they continue it."""
     new = np.flatnonzero((np.diff(sample) != 1) | (np.diff(rows) != 1)) + 1
     first = np.concatenate([[0], new])
@@ -151,8 +149,8 @@ def place_by_stamp(stamps: Stamps, rate: float, *, max_gap: float, where: str) -
     """
     period = sum(period_ns(rate))
     state, ring = kernel.new_state()
-    runs: list[NDArray[np.int64]] = []
-    events: list[NDArray[np.int64]] = []
+    runs: list[Integers] = []
+    events: list[Integers] = []
     first = np.empty(0, dtype=np.int64)
     for rows, values in recut_blocks(stamps, _STRETCH_ROWS, LOOK_AHEAD):
         if len(first) == 0:
@@ -167,7 +165,7 @@ def place_by_stamp(stamps: Stamps, rate: float, *, max_gap: float, where: str) -
     return make_placement(_find_start(first, period), runs, events)
 
 
-def _find_start(stamps: NDArray[np.int64], period: float) -> int:
+def _find_start(stamps: Integers, period: float) -> int:
     """Return the first stamp [ns], corrected if it disagrees with all others, which agree."""
     samples = (stamps[1:] - stamps[0]) / period
     off = samples - np.rint(samples)
@@ -184,8 +182,8 @@ class _Windows(NamedTuple):
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     reach: NDArray[np.float64]
-    up: NDArray[np.int64]
-    down: NDArray[np.int64]
+    up: Integers
+    down: Integers
 
 
 def _make_windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, int]:
@@ -279,13 +277,13 @@ def place_by_count(
 
 
 def _counted_runs(
-    stamps: Stamps, cuts: NDArray[np.int64], shifts: NDArray[np.int64]
-) -> tuple[list[NDArray[np.int64]], NDArray[np.int64]]:
+    stamps: Stamps, cuts: Integers, shifts: Integers
+) -> tuple[list[Integers], Integers]:
     """Make runs of rows by count; from count ``cuts[i]`` on, sample = count + ``shifts[i]``.
 
     Also return the row number of each cut.
     """
-    runs: list[NDArray[np.int64]] = []
+    runs: list[Integers] = []
     cut_rows, done = cuts.copy(), 0
     for rows, _ in stamps():
         if len(rows):

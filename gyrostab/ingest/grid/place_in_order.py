@@ -12,12 +12,11 @@ from gyrostab.ingest.grid.jitter import (
     GAIN,
     MIN_SIGMA,
     TRACE_ROWS,
-    Integers,
     JitterModel,
     observe_rows,
 )
 from gyrostab.ingest.grid.place import HOLD, NO_STAMPS, Placement, append_runs, make_placement
-from gyrostab.ingest.grid.starting_period import SECOND, Stamps, recut_blocks
+from gyrostab.ingest.grid.starting_period import SECOND, Integers, Stamps, recut_blocks
 from gyrostab.kernels.grid.course import find_breaks, find_phase, trace
 from gyrostab.kernels.grid.stamps import DUPLICATE, RESTART, STEP
 from gyrostab.time.grid import period_ns

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
 from gyrostab.ingest.columns.pieces import find_line
@@ -32,7 +31,7 @@ from gyrostab.ingest.grid.rate import (
     is_far_worse,
 )
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, stamp_blocks
-from gyrostab.ingest.grid.starting_period import SECOND, Stamps
+from gyrostab.ingest.grid.starting_period import SECOND, Integers, Stamps
 from gyrostab.kernels.grid.stamps import DUPLICATE, NO_STAMP, RESTART, STEP
 from gyrostab.schema import signal_name
 from gyrostab.store.lazy import find_source, read_slice
@@ -202,7 +201,7 @@ def _is_sharp(jitter: JitterModel | None) -> bool:
     return jitter is None or jitter.sigma <= _SHARP_SIGMA
 
 
-def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> NDArray[np.int64]:
+def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> Integers:
     """Find the rows after each set-back of the clock that repeat rows before it.
 
     Rows are equal if their stamps and values are. A clock that restarts may write the same stamps
@@ -265,7 +264,7 @@ def _count_repeated(raw: xr.Dataset, name: str, source: int, row: int) -> int:
     return length if changes and Match(compared, same).alike else 0
 
 
-def with_repeats(placement: Placement, raw: xr.Dataset, repeats: NDArray[np.int64]) -> Placement:
+def with_repeats(placement: Placement, raw: xr.Dataset, repeats: Integers) -> Placement:
     """Add repeated rows as duplicates to the events of a placement made without them."""
     events = [placement.events]
     for row, source, length in repeats.tolist():

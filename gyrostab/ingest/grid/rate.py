@@ -30,6 +30,8 @@ from gyrostab.ingest.grid.starting_period import (
     MIN_TICKS,
     SECOND,
     SHARED_SHARE,
+    Integers,
+    Parts,
     Stamps,
     clock_tick,
     comb_peaks,
@@ -148,7 +150,7 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
 
 
 def _fit_jitter(
-    parts: list[NDArray[np.int64]], guesses: list[tuple[float, float]], coarse: bool, sure: float
+    parts: Parts, guesses: list[tuple[float, float]], coarse: bool, sure: float
 ) -> JitterModel | None:
     """Fit the jitter of noisy stamps, of all rows or of one row of each group.
 
@@ -178,7 +180,7 @@ def _estimate_with_jitter(
 
 
 def _finer_rate(
-    parts: list[NDArray[np.int64]],
+    parts: Parts,
     peaks: list[tuple[float, float]],
     jitter: JitterModel,
     sure: float,
@@ -192,7 +194,7 @@ def _finer_rate(
     return float(f"{SECOND / best.period:.4g}")
 
 
-def _mean_rate(parts: list[NDArray[np.int64]]) -> float:
+def _mean_rate(parts: Parts) -> float:
     """Return the median number of rows a second of stretches."""
     rates = [
         SECOND * (len(part) - 1) / (part[-1] - part[0]) for part in parts if part[-1] > part[0]
@@ -202,7 +204,7 @@ def _mean_rate(parts: list[NDArray[np.int64]]) -> float:
 
 def _sample_stamps(
     stamps: Stamps,
-) -> tuple[Stamps, list[NDArray[np.int64]], list[NDArray[np.int64]], float]:
+) -> tuple[Stamps, Parts, Parts, float]:
     """Return stamps in even blocks, stretches, their readable stamps, and `_trusted_samples`."""
     stamps = partial(recut_blocks, stamps, _BLOCK)
     stretches = sample_stretches(stamps)
@@ -210,7 +212,7 @@ def _sample_stamps(
     return stamps, stretches, parts, _trusted_samples(parts)
 
 
-def _trusted_samples(parts: list[NDArray[np.int64]]) -> float:
+def _trusted_samples(parts: Parts) -> float:
     """Return the samples over which counting by a period from these stretches is reliable."""
     return min(_MAX_TRUSTED_SAMPLES, max(5.0, sum(len(part) - 1 for part in parts) / 20))
 
@@ -287,9 +289,7 @@ def is_far_worse(stamps: Stamps, given: RateEstimate, estimated: RateEstimate) -
     )
 
 
-def _estimate_sharp(
-    stamps: Stamps, parts: list[NDArray[np.int64]], rate: float
-) -> RateEstimate | None:
+def _estimate_sharp(stamps: Stamps, parts: Parts, rate: float) -> RateEstimate | None:
     """Estimate the rate near a nominal one [Hz] if steps are whole periods, and some are single."""
     period = SECOND / rate
     steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
@@ -333,7 +333,7 @@ def deviating_stretches(stamps: Stamps, period: float) -> list[tuple[int, int, f
     return stretches
 
 
-def _stretch_paces(values: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _stretch_paces(values: Integers) -> tuple[Integers, NDArray[np.float64]]:
     """Return first row and median step [ns] of every stretch."""
     n_stretches = len(values) // _STRETCH
     end = n_stretches * _STRETCH

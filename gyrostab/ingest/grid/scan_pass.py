@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import read_stamps
+from gyrostab.ingest.grid.starting_period import Block, Integers
 from gyrostab.ingest.uniform.core import merge_spans
 from gyrostab.schema import texts
 from gyrostab.store.lazy import read_slice
@@ -31,8 +32,8 @@ class ScanPass:
     present: NDArray[np.uint8]  # one bit a row: whether any axis has a number
     absent: int  # rows without any number
     #: (n, 2): half-open spans of present rows in which an axis is NaN, or infinite.
-    unreadable: NDArray[np.int64]
-    infinite: NDArray[np.int64]
+    unreadable: Integers
+    infinite: Integers
     constant: list[str]  # axes whose value never changes
     empty: list[str]  # axes without a number
     #: Channel on ``row`` -> number of rows with a value.
@@ -75,7 +76,7 @@ def _scan_block(
     )
 
 
-def find_spans(bad: Any, offset: int) -> NDArray[np.int64]:
+def find_spans(bad: Any, offset: int) -> Integers:
     """Return the half-open spans in which `bad` is true, as rows from `offset` on."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]])))
     return np.asarray(edges.reshape(-1, 2) + offset, dtype=np.int64)
@@ -108,12 +109,10 @@ def scan_rows(raw: xr.Dataset, name: str) -> ScanPass:
     )
 
 
-def stamp_blocks(
-    raw: xr.Dataset, scanned: ScanPass, *, all_rows: bool = False
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def stamp_blocks(raw: xr.Dataset, scanned: ScanPass, *, all_rows: bool = False) -> Iterator[Block]:
     """Yield row numbers and stamps [ns] (or `NO_STAMP`) of rows with a sample, in blocks."""
 
-    def read_block(begin: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def read_block(begin: int) -> Block:
         end = min(scanned.rows, begin + BLOCK_ROWS)
         values = read_stamps(raw, begin, end)
         if not scanned.repeated and (all_rows or scanned.absent == 0):

@@ -32,18 +32,20 @@ _PEAK_WIDTH = 0.02  # relative distance of two peaks, at least
 #: independent steps below which they do not.
 _MIN_SPAN_ROWS, _SPAN_ROWS, _MIN_ACCUMULATION = 16, 256, 0.2
 
+Integers = NDArray[np.int64]
+Parts = list[Integers]
+#: Rows and their stamps, or the stamps that are used of some rows.
+Block = tuple[Integers, Integers]
 #: Returns a new iterator over all blocks of row numbers and stamps at each call.
-Stamps = Callable[[], Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]]
+Stamps = Callable[[], Iterator[Block]]
 
 
-def recut_blocks(
-    stamps: Stamps, size: int, ahead: int = 0
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def recut_blocks(stamps: Stamps, size: int, ahead: int = 0) -> Iterator[Block]:
     """Yield rows and stamps in blocks of `size`, independent of the input blocks.
 
     Each block has `ahead` more rows, with which the next one begins; only the last is shorter.
     """
-    held: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+    held: list[Block] = []
     waiting = 0
     for block in stamps():
         held.append(block)
@@ -61,8 +63,8 @@ def recut_blocks(
 
 
 def _concatenate_blocks(
-    held: list[tuple[NDArray[np.int64], NDArray[np.int64]]],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    held: list[Block],
+) -> Block:
     """Concatenate blocks of rows and stamps; a single non-empty block is not copied."""
     held = [block for block in held if len(block[0])]
     if len(held) == 1:
@@ -71,19 +73,19 @@ def _concatenate_blocks(
     return rows, values
 
 
-def readable_stamps(block: NDArray[np.int64]) -> NDArray[np.int64]:
+def readable_stamps(block: Integers) -> Integers:
     """Return the readable stamps, without a copy if all are readable."""
     is_readable = block != NO_STAMP
     return block if is_readable.all() else block[is_readable]
 
 
-def sample_stretches(stamps: Stamps) -> list[NDArray[np.int64]]:
+def sample_stretches(stamps: Stamps) -> Parts:
     """Return stretches of stamps from the whole log, a few hundred thousand in all.
 
     Each has at least two readable stamps; unreadable ones are `NO_STAMP`, so that rows can be
     counted.
     """
-    stretches: list[NDArray[np.int64]] = []
+    stretches: Parts = []
     number, stride = 0, 1  # of all stretches so far; every stride-th is kept
     for _, block in stamps():
         for begin in range(0, len(block), _STRETCH):
@@ -95,7 +97,7 @@ def sample_stretches(stamps: Stamps) -> list[NDArray[np.int64]]:
     return [part for part in stretches if np.count_nonzero(part != NO_STAMP) > 1]
 
 
-def cut_stretches(parts: list[NDArray[np.int64]], length: int) -> NDArray[np.float64]:
+def cut_stretches(parts: Parts, length: int) -> NDArray[np.float64]:
     """Return stretches of `length` stamps, relative to the first stamp of each [ns]."""
     stride = length if sum(map(len, parts)) > 200 * length else 1  # overlap in a short log
     stretches = [
@@ -122,7 +124,7 @@ def _refine_period(steps: NDArray[np.float64], period: float) -> float:
     return period
 
 
-def finer_period(parts: list[NDArray[np.int64]], period: float) -> float | None:
+def finer_period(parts: Parts, period: float) -> float | None:
     """Find the period [ns] of recurring steps such as 1, 1, 3, 1, 1, 3; None if there is none.
 
     In such a log the same two of every five rows are missing, or rows are read in groups; stamps
@@ -145,9 +147,7 @@ def finer_period(parts: list[NDArray[np.int64]], period: float) -> float | None:
     return single if (is_whole & np.any(recurrences, axis=0) & uneven).mean() > 0.5 else None
 
 
-def _residual_range(
-    parts: list[NDArray[np.int64]], length: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _residual_range(parts: Parts, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Fit lines to stretches of `length` stamps: slopes [ns a row], residual ranges [ns]."""
     values = cut_stretches(parts, length)
     x = np.arange(length) - (length - 1) / 2
@@ -156,7 +156,7 @@ def _residual_range(
     return slope, np.ptp(residuals, axis=1) if len(residuals) else np.empty(0)
 
 
-def _has_shared_stamps(parts: list[NDArray[np.int64]], steps: NDArray[np.float64]) -> bool:
+def _has_shared_stamps(parts: Parts, steps: NDArray[np.float64]) -> bool:
     """Return whether rows share stamps because the clock is coarse, not by doubling."""
     if np.mean(steps == 0) < SHARED_SHARE:
         return False
@@ -179,7 +179,7 @@ def step_scatter(steps: NDArray[np.float64], period: float) -> float:
     return 1.4826 * float(np.median(np.abs(inliers - np.rint(inliers)))) if len(inliers) else 0.5
 
 
-def period_of_lines(parts: list[NDArray[np.int64]]) -> float | None:
+def period_of_lines(parts: Parts) -> float | None:
     """Return the period of stretches whose row count predicts the stamps to less than a sample."""
     length = min(16, max(len(part) for part in parts))
     slope, spread = _residual_range(parts, length)
@@ -202,7 +202,7 @@ def period_of_lines(parts: list[NDArray[np.int64]]) -> float | None:
     return period
 
 
-def starting_period(stretches: list[NDArray[np.int64]]) -> tuple[float, bool, bool]:
+def starting_period(stretches: Parts) -> tuple[float, bool, bool]:
     """Return period [ns] to 0.1 %, whether rows are counted, whether stamps are shared.
 
     The stretches are those of `sample_stretches`.
@@ -230,7 +230,7 @@ def starting_period(stretches: list[NDArray[np.int64]]) -> tuple[float, bool, bo
     )
 
 
-def _is_bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], period: float) -> bool:
+def _is_bursty(parts: Parts, steps: NDArray[np.float64], period: float) -> bool:
     """Return whether long steps are pauses between bursts, not multiples of the short ones."""
     long = steps[(steps > 1.5 * period) & (steps < 50 * period)]
     inliers = steps[np.abs(steps) < 50 * period]
@@ -242,7 +242,7 @@ def _is_bursty(parts: list[NDArray[np.int64]], steps: NDArray[np.float64], perio
     return bool(is_long) and not losses_accumulate(parts)
 
 
-def time_per_row(stretches: list[NDArray[np.int64]], *, ticks: bool = False) -> float:
+def time_per_row(stretches: Parts, *, ticks: bool = False) -> float:
     """Return the mean time per row [ns]; with `ticks`, between changes of a shared stamp.
 
     Rows without a readable stamp count.
@@ -264,7 +264,7 @@ def time_per_row(stretches: list[NDArray[np.int64]], *, ticks: bool = False) -> 
     return float(np.median(totals[is_long, 0] / totals[is_long, 1]))
 
 
-def _tick_steps(steps: NDArray[np.float64], rows: NDArray[np.int64]) -> tuple[float, int]:
+def _tick_steps(steps: NDArray[np.float64], rows: Integers) -> tuple[float, int]:
     """Return time [ns] and rows between changes of a shared stamp, without gaps.
 
     A change whose time per row exceeds three times the median is a gap. Each change is kept or left
@@ -277,7 +277,7 @@ def _tick_steps(steps: NDArray[np.float64], rows: NDArray[np.int64]) -> tuple[fl
     return float(times[good].sum()), int(counts[good].sum())
 
 
-def losses_accumulate(parts: list[NDArray[np.int64]]) -> bool:
+def losses_accumulate(parts: Parts) -> bool:
     """Return whether the time of many rows varies as much as independent steps make it vary.
 
     It does if samples are lost at random; pauses between packets of rows do not change the number
@@ -295,12 +295,12 @@ def losses_accumulate(parts: list[NDArray[np.int64]]) -> bool:
     return bool(scatter**2 >= _MIN_ACCUMULATION * length * usual.var())
 
 
-def clock_tick(parts: list[NDArray[np.int64]]) -> float:
+def clock_tick(parts: Parts) -> float:
     """Return the largest time [ns] of which all stamps are multiples, from the first on."""
     return float(np.gcd.reduce(np.concatenate([np.diff(part) for part in parts])))
 
 
-def comb_peaks(parts: list[NDArray[np.int64]]) -> list[tuple[float, float]]:
+def comb_peaks(parts: Parts) -> list[tuple[float, float]]:
     """Return periods [ns] near multiples of which the stamps lie, and the jitter [samples].
 
     The power of N stamps at the sampling frequency is 1 + N exp(-4 pi^2 sigma^2) for a jitter of
@@ -337,7 +337,7 @@ def comb_peaks(parts: list[NDArray[np.int64]]) -> list[tuple[float, float]]:
     return peaks
 
 
-def _count_stamps(bins: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+def _count_stamps(bins: Integers) -> list[NDArray[np.float64]]:
     """Count the stamps in each bin, in stretches of `_BINS` bins that hold at least 64 stamps."""
     stretch = bins // _BINS
     numbers, rows = np.unique(stretch, return_counts=True)
