@@ -94,17 +94,6 @@ def unit_label(units: Any) -> str:
     return f"[{text}]" if text else ""
 
 
-def duration(seconds: float) -> str:
-    """Format a length of time.
-
-    Examples
-    --------
-    >>> duration(90.0), duration(0.25), duration(7200)
-    ('1.5 min', '0.25 s', '2 h')
-    """
-    return format_duration(seconds, " ")
-
-
 def unit_of_time(seconds: float) -> tuple[float, str]:
     """Choose the largest unit that is at most a third of a length of time: seconds and name.
 
@@ -133,10 +122,10 @@ def log_edges(values: NDArray[Any]) -> NDArray[Any]:
 
 def window_text(product: xr.Dataset) -> str:
     """Describe window and step for a title; empty if the attributes are missing."""
-    window, step = product.attrs.get("window_s"), product.attrs.get("step_s")
-    if window is None or step is None:
+    if "window_s" not in product.attrs or "step_s" not in product.attrs:
         return ""
-    return f"windows of {duration(float(window))} every {duration(float(step))}"
+    window, step = (float(product.attrs[name]) for name in ("window_s", "step_s"))
+    return f"windows of {format_duration(window, ' ')} every {format_duration(step, ' ')}"
 
 
 def axis_names(dataset: xr.Dataset, axis: str | None = None) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -233,31 +234,21 @@ def _merge_windows(
 
     The cells of an axis are the Allan deviation and the mask of weighted cells, shape (time, tau).
     """
-    size = product.sizes["time"]
-    merged = max(1, -(-size // columns))
-    edges = np.arange(0, size, merged)
-    cells = []
-    for name in names:
-        part = product.sel(axis=name)
-        avar = np.asarray(part["avar"].values, dtype=np.float64)
-        weighted = np.logical_or.reduceat(part["estimator"].values == _WEIGHTED, edges, axis=0)
-        number = np.add.reduceat(np.isfinite(avar).astype(float), edges, axis=0)
-        total = np.add.reduceat(np.nan_to_num(avar, nan=0.0), edges, axis=0)
-        # the published recursion drifts below zero where there is almost no noise
-        has_mean = (number > 0) & (total >= 0.0)
-        mean = np.divide(total, number, out=np.full_like(total, np.nan), where=has_mean)
-        cells.append((np.sqrt(mean), weighted & np.isfinite(mean)))
-    return cells, merged
+    merged = max(1, -(-product.sizes["time"] // columns))
+    part = product[["avar", "estimator"]].sel(axis=names).drop_vars("time").compute()
+    is_weighted = (part["estimator"] == _WEIGHTED).astype(np.float64)
+    avar = part["avar"].astype(np.float64).coarsen(time=merged, boundary="pad").mean().values
+    weighted = is_weighted.coarsen(time=merged, boundary="pad").max().values > 0.0
+    # the published recursion drifts below zero where there is almost no noise
+    deviation = np.sqrt(np.where(avar >= 0.0, avar, np.nan))
+    return list(zip(deviation, weighted & np.isfinite(deviation), strict=True)), merged
 
 
 def _divide_by_median(deviation: NDArray[Any]) -> NDArray[Any]:
     """Divide by the median over time; NaN where that is zero, as of a constant signal."""
-    median = np.zeros(deviation.shape[1])
-    has_values = np.isfinite(deviation).any(axis=0)
-    median[has_values] = np.nanmedian(deviation[:, has_values], axis=0)
-    ratio = np.full_like(deviation, np.nan)
-    np.divide(deviation, median, out=ratio, where=median > 0)
-    return ratio
+    cells = pd.DataFrame(deviation)
+    median = cells.median()
+    return (cells / median.where(median > 0.0)).to_numpy()
 
 
 def _colour_limits(values: list[NDArray[Any]], *, relative: bool) -> tuple[float, float]:

@@ -20,7 +20,6 @@ from gyrostab.plot.style import (
     INCH_MM,
     PAGE_MM,
     draws_figure,
-    duration,
     encode_png,
     label_log_axis,
     new_figure,
@@ -31,6 +30,7 @@ from gyrostab.plot.style import (
 from gyrostab.report.charts import page_text
 from gyrostab.store.output import new_output
 from gyrostab.store.remote import find_url, upload_file
+from gyrostab.time.durations import format_duration
 from gyrostab.units import HOUR
 
 _PANEL_MM = 45.0
@@ -171,7 +171,7 @@ def _describe_run(row: Mapping[Any, Any], axes: list[str], folder: Path) -> dict
         "link": quote(report) if report else "",
         "tool": row["tool"],
         "start": f"{row['start']:%Y-%m-%d %H:%M}",
-        "length": duration(row["span [s]"]),
+        "length": format_duration(row["span [s]"], " "),
         "seconds": row["span [s]"],
         "rate": f"{row['rate [Hz]']:.6g}",
         "missing": f"{100.0 * row['missing_share']:.3g}",

@@ -12,11 +12,12 @@ import xarray as xr
 from gyrostab.allan.variance import variance_name
 from gyrostab.ingest.convert import as_log
 from gyrostab.noise import LAWS
-from gyrostab.plot.style import axis_names, duration, encode_png, unit_symbol
+from gyrostab.plot.style import axis_names, encode_png, unit_symbol
 from gyrostab.report.charts import page_text
 from gyrostab.report.product_charts import product_charts, window_data
 from gyrostab.schema import GAP_CAUSES, check_product, texts
 from gyrostab.store.output import new_output
+from gyrostab.time.durations import format_duration
 from gyrostab.wording import format_share
 
 if TYPE_CHECKING:
@@ -132,7 +133,7 @@ def _summarise_record(product: xr.Dataset) -> str:
     rate = product.attrs.get("sampling_rate_hz")
     speed = f" at {float(rate):g} Hz" if rate is not None else ""
     axis_text = f"{len(axes)} gyro {'axes' if len(axes) != 1 else 'axis'} ({', '.join(axes)})"
-    length = duration(float((end - start) / np.timedelta64(1, "s")))
+    length = format_duration(float((end - start) / np.timedelta64(1, "s")), " ")
     return (
         f"{axis_text}{speed}{origin}, {length} from {_stamp_text(start)} to {_stamp_text(end)} "
         f"UTC, analysed in {product.sizes['time']} windows."
@@ -175,7 +176,7 @@ def _list_facts(product: xr.Dataset) -> list[tuple[str, str]]:
     attrs = product.attrs
     start, end = _record_span(product)
     tau = product["tau"].values
-    shortest, longest = (duration(float(tau[end])) for end in (0, -1))
+    shortest, longest = (format_duration(float(tau[end]), " ") for end in (0, -1))
     missing = (f"{axis}: {format_share(share)}" for axis, share in _missing_shares(product).items())
     facts = [
         ("Files", ", ".join(_file_names(product)) or "not recorded"),
@@ -187,7 +188,9 @@ def _list_facts(product: xr.Dataset) -> list[tuple[str, str]]:
     ]
     timed = {"window_s": "Window", "step_s": "Step"}
     facts += [
-        (label, duration(float(attrs[name]))) for name, label in timed.items() if name in attrs
+        (label, format_duration(float(attrs[name]), " "))
+        for name, label in timed.items()
+        if name in attrs
     ]
     if "sampling_rate_hz" in attrs:
         facts.append(("Sampling rate", f"{float(attrs['sampling_rate_hz']):g} Hz"))
@@ -219,7 +222,7 @@ def _list_gaps(log: xr.Dataset) -> list[dict[str, Any]]:
         {
             "start": _stamp_text(log["gap_start"].values[i]),
             "end": _stamp_text(log["gap_end"].values[i]),
-            "length": duration(float(samples[i]) / rate),
+            "length": format_duration(float(samples[i]) / rate, " "),
             "samples": f"{int(samples[i]):,}".replace(",", " "),
             "cause": causes[int(log["gap_cause"].values[i])].replace("_", " "),
         }
@@ -229,9 +232,8 @@ def _list_gaps(log: xr.Dataset) -> list[dict[str, Any]]:
 
 def _summarise_gaps(log: xr.Dataset, gaps: list[dict[str, Any]]) -> str:
     total = log.sizes["gap"]
-    missing = duration(
-        float(np.sum(log["gap_samples"].values)) / float(log.attrs["sampling_rate_hz"])
-    )
+    seconds = float(log["gap_samples"].sum()) / float(log.attrs["sampling_rate_hz"])
+    missing = format_duration(seconds, " ")
     shown = f" The table lists the {len(gaps)} longest." if total > len(gaps) else ""
     return f"{total} gap{'s' if total != 1 else ''}, {missing} in total.{shown}"
 

@@ -66,7 +66,9 @@ def draw_static(chart: go.Figure) -> Figure:
     legend: list[tuple[str, Any]] = []
     for trace in chart.data:
         name = trace.yaxis or "y"
-        x = _read_times(trace.x) if axes[name][0].type == "date" else trace.x
+        x = trace.x
+        if axes[name][0].type == "date":  # milliseconds
+            x = np.asarray(x * 1e6).astype(np.int64).astype("datetime64[ns]")
         if trace.type == "heatmap":
             _draw_map(panels[name], x, trace, layout.coloraxis)
         elif artist := _draw_scatter(panels[name], x, trace):
@@ -93,11 +95,6 @@ def draw_static(chart: go.Figure) -> Figure:
             frameon=False,
         )
     return figure
-
-
-def _read_times(milliseconds: NDArray[np.float64]) -> NDArray[np.datetime64]:
-    """Convert times as plotly counts them."""
-    return np.asarray(milliseconds * 1e6).astype(np.int64).astype("datetime64[ns]")
 
 
 def _unescape_text(text: str) -> str:

@@ -70,13 +70,13 @@ def find_time_grids(dataset: xr.Dataset) -> dict[Any, Any]:
 def encode_first_stamp(grid: Any, attrs: dict[Any, Any], divisor: int) -> xr.Variable:
     """Encode a computed time axis: its first stamp, with rate and exact rule as attributes."""
     (dim,) = grid.dims
-    first = int(grid_times(grid.start, grid.rate, grid.first))
+    first = int(grid_times(grid.start, grid.rate, grid.samples.start))
     attributes = {
         "long_name": f"time of the first sample on the dimension {index_dim(dim)}",
         "comment": "sample n (from 0) is at this time + n / sampling_rate_hz; "
         f"{GRID} is the exact rule: "
         "start_ns + round((first + stride * n) * 1e9 / rate_hz) nanoseconds since 1970",
-        "sampling_rate_hz": grid.rate / grid.stride,
+        "sampling_rate_hz": grid.rate / grid.samples.step,
     }
     return xr.Variable(
         (),
@@ -102,8 +102,8 @@ def _encode_rule(grid: Any, attrs: dict[Any, Any]) -> dict[str, str]:
         "dim": dim,
         "start_ns": grid.start,
         "rate_hz": grid.rate,
-        "first": grid.first,
-        "stride": grid.stride,
+        "first": grid.samples.start,
+        "stride": grid.samples.step,
         "size": grid.size,
     }
     return {
@@ -121,7 +121,7 @@ class _GridStamps(RowSource):
 
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
         grid = self.grid
-        samples = grid.first + grid.stride * np.arange(begin, begin + out.size)
+        samples = grid.samples.start + grid.samples.step * np.arange(begin, begin + out.size)
         np.floor_divide(grid_times(grid.start, grid.rate, samples), self.divisor, out=out)
 
 
@@ -133,8 +133,8 @@ def has_whole_microseconds(
         if name in grids:
             grid = grids[name]
             nanoseconds, fraction = period_ns(grid.rate)
-            if int(grid_times(grid.start, grid.rate, grid.first)) % 1000 or (
-                stamps and (fraction or nanoseconds * grid.stride % 1000)
+            if int(grid_times(grid.start, grid.rate, grid.samples.start)) % 1000 or (
+                stamps and (fraction or nanoseconds * grid.samples.step % 1000)
             ):
                 return False
         elif variable.dtype.kind == "M" and np.any(to_nanoseconds(variable.values) % 1000):
@@ -213,14 +213,9 @@ def make_time_axes(
                 "cut it in Python with gyrostab.open_log(...).isel or .sel, "
                 "and write it with gyrostab.to_netcdf"
             )
-        axes[name] = time_coordinate(
-            rule["start_ns"],
-            rule["rate_hz"],
-            size,
-            name=dim,
-            first=rule["first"],
-            stride=rule["stride"],
-        )
+        first, stride = rule["first"], rule["stride"]
+        samples = range(first, first + stride * size, stride)
+        axes[name] = time_coordinate(rule["start_ns"], rule["rate_hz"], samples, name=dim)
     return axes
 
 

@@ -333,7 +333,9 @@ class TimeGridIndex(CoordinateTransformIndex):
         )
 
 
-def time_coordinate(start: int, rate: float, size: int, *, name: str = "time") -> xr.Coordinates:
+def time_coordinate(
+    start: int, rate: float, samples: int | range, *, name: str = "time"
+) -> xr.Coordinates:
     """Lazy, exact, uniform time coordinate.
 
     Parameters
@@ -342,8 +344,8 @@ def time_coordinate(start: int, rate: float, size: int, *, name: str = "time") -
         Stamp of sample 0 [ns since 1970-01-01T00:00:00].
     rate : float
         Sampling rate [Hz], taken as the decimal number that it prints as.
-    size : int
-        Number of samples on the axis.
+    samples : int or range
+        Number of samples on the axis, or those that it holds of the grid that begins at `start`.
     name : str
         Name of the coordinate and of its dimension.
 
@@ -361,4 +363,5 @@ def time_coordinate(start: int, rate: float, size: int, *, name: str = "time") -
     array(['1970-01-01T00:00:00.000000000', '1970-01-01T00:00:00.005000000'],
           dtype='datetime64[ns]')
     """
-    return xr.Coordinates.from_xindex(TimeGridIndex(_GridTransform(start, rate, range(size), name)))
+    samples = samples if isinstance(samples, range) else range(samples)
+    return xr.Coordinates.from_xindex(TimeGridIndex(_GridTransform(start, rate, samples, name)))

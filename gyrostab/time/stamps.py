@@ -133,7 +133,11 @@ def stamp_ns(start: Any, name: str = "start") -> int:
         return int(start)
     try:
         if isinstance(start, str):
-            stamp = _parse_stamp_ns(start)
+            fields = split_instant(start)
+            if fields is None:
+                raise ValueError("the year does not come first, with four digits")
+            days = (date(*fields[:3]) - date(1970, 1, 1)).days
+            stamp = days * 86400 * NANOSECONDS + fields[3]
         else:
             time = pd.Timestamp(start)
             if pd.isna(time) or isinstance(start, float | np.floating):
@@ -152,14 +156,6 @@ def stamp_ns(start: Any, name: str = "start") -> int:
             "give another date"
         )
     return stamp
-
-
-def _parse_stamp_ns(text: str) -> int:
-    fields = split_instant(text)
-    if fields is None:
-        raise ValueError("the year does not come first, with four digits")
-    year, month, day, nanoseconds = fields
-    return (date(year, month, day) - date(1970, 1, 1)).days * 86400 * NANOSECONDS + nanoseconds
 
 
 def time_of_day() -> str:

@@ -90,22 +90,17 @@ def _check_order(stamps: NDArray[np.int64]) -> None:
     behind = np.diff(stamps) <= 0
     if behind.any():
         at = int(np.argmax(behind))
-        raise TimeError(_describe_disorder(at, int(stamps[at]), int(stamps[at + 1])))
-
-
-def _describe_disorder(place: int, before: int, after: int) -> str:
-    """Describe which two samples are out of order."""
-    first, second = (str(np.datetime64(stamp, "ns")) for stamp in (before, after))
-    if before == after:
-        return (
-            f"samples {place} and {place + 1} of the log have the same time, {first}; keep one "
-            "of each: log.drop_duplicates('time')"
+        first, second = (str(np.datetime64(int(stamp), "ns")) for stamp in stamps[at : at + 2])
+        if first == second:
+            raise TimeError(
+                f"samples {at} and {at + 1} of the log have the same time, {first}; keep one "
+                "of each: log.drop_duplicates('time')"
+            )
+        raise TimeError(
+            f"the time of the log runs backwards: sample {at} is at {first} and sample {at + 1} "
+            f"at {second}; sort it, "
+            "log.sortby('time'), or give overlapping logs to gyrostab.read_log, which joins them"
         )
-    return (
-        f"the time of the log runs backwards: sample {place} is at {first} and sample {place + 1} "
-        f"at {second}; sort it, "
-        "log.sortby('time'), or give overlapping logs to gyrostab.read_log, which joins them"
-    )
 
 
 def _count_samples(steps: NDArray[np.int64], base: float) -> int:
