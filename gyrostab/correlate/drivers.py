@@ -102,7 +102,8 @@ def _align_channel(
         factor, offset, units = _convert_units(product[channel], f"product[{channel!r}]")
         mean, rate = _align_product_channel(product, channel, lags, step)
     else:
-        name = _name_channel(channel, product)
+        name = str(channel.name or "channel")
+        name += "_of_file" * (name in product.variables)
         factor, offset, units = _convert_units(channel, "channel")
         mean, rate = _align_file_channel(channel, product, lags, step)
     mean, rate = mean * factor + offset, rate * factor
@@ -151,11 +152,6 @@ def _channel_names(product: xr.Dataset) -> list[str]:
         name for name, v in product.data_vars.items() if v.dims == ("time",) and v.dtype.kind == "f"
     )
     return [str(name) for name in numeric]
-
-
-def _name_channel(channel: xr.DataArray, product: xr.Dataset) -> str:
-    name = str(channel.name or "channel")
-    return f"{name}_of_file" if name in product.variables else name
 
 
 def _grid_positions(product: xr.Dataset, step: float) -> NDArray[np.int64]:

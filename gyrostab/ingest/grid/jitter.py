@@ -328,19 +328,14 @@ def fit_pieces(
 ) -> NDArray[np.float64]:
     """Sum each unbroken piece: n, mean count, mean stamp [ns], cc, ct, squared residuals."""
 
-    def sum_block(
-        block: Block,
-    ) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
-        """Return first stamp, reference stamp and sums of the pieces of a block."""
+    def sum_block(block: Block) -> tuple[Integers, NDArray[np.float64]]:
+        """Return the first stamp of a block that is used, if any, and the sums of its pieces."""
         values = block[1]
         readable = readable_stamps(values)
-        if len(readable) == 0:
-            return None, np.empty((0, 6))
-        first = int(readable[0])
         if jitter is not None:
             readable, count, piece = count_samples(np.arange(len(values)), values, jitter, longest)
         elif counted:
-            piece = np.concatenate([[0], np.cumsum(np.abs(np.diff(readable)) > longest)])
+            piece = np.cumsum(np.abs(np.diff(readable, prepend=readable[:1])) > longest)
             count = np.flatnonzero(values != NO_STAMP)  # rows without a readable stamp count too
         else:
             count, piece = track(readable, period, TRACK_GAIN, longest)
@@ -348,16 +343,15 @@ def fit_pieces(
         if coarse and jitter is None and tick.size > 1:
             # the time is exact only where the stamp changes
             readable, count, piece = readable[tick], count[tick], piece[tick]
-        sums = piece_sums(readable, count, piece, period)
-        return (first, int(readable[0])) if len(readable) else None, sums
+        return readable[:1], piece_sums(readable, count, piece, period)
 
     table = np.empty((0, 6))
     zero: int | None = None
     for first, sums in map_in_order(sum_block, stamps()):
-        if first is None:
+        if len(first) == 0:
             continue
-        zero = first[0] if zero is None else zero
-        sums[:, 2] += first[1] - zero
+        zero = int(first[0]) if zero is None else zero
+        sums[:, 2] += int(first[0]) - zero
         table = np.concatenate([table, sums])
         if len(table) > _MAX_PIECES:  # keep the largest pieces
             table = table[np.argsort(-table[:, 3], kind="stable")[: _MAX_PIECES // 2]]
