@@ -168,11 +168,15 @@ def write_diagnosis(
     """
     check_diagnosis(diagnosis.content)
     directory = Path(directory)
+    files = [Path(name).name for name in diagnosis.content["recording"]["files"]]
+    heading = (
+        f"The simulation of {', '.join(files) or 'the recording'} with what its diagnosis found.\n"
+        "gyrostab simulate model.toml --like RECORDING -o simulation.nc"
+    )
     with new_output(directory, overwrite=overwrite, find_foreign=find_foreign_file) as temporary:
         (temporary / "diagnosis.json").write_text(diagnosis.to_json(), encoding="utf-8")
-        (temporary / "model.toml").write_text(
-            model_text(diagnosis.model, heading=_make_heading(diagnosis)), encoding="utf-8"
-        )
+        model = model_text(diagnosis.model, heading=heading)
+        (temporary / "model.toml").write_text(model, encoding="utf-8")
         to_netcdf(diagnosis.surfaces, temporary / "diagnosis.nc")
         write_diagnosis_report(diagnosis, temporary / "report.html")
     return [directory / name for name in FILES]
@@ -194,17 +198,6 @@ def is_diagnosis(directory: Path) -> bool:
     content = read_json(directory / "diagnosis.json")
     return isinstance(content, dict) and str(content.get("schema")).startswith(
         "gyrostab.diagnosis/"
-    )
-
-
-def _make_heading(diagnosis: Diagnosis) -> str:
-    files = (
-        ", ".join(Path(name).name for name in diagnosis.content["recording"]["files"])
-        or "the recording"
-    )
-    return (
-        f"The simulation of {files} with what its diagnosis found.\n"
-        "gyrostab simulate model.toml --like RECORDING -o simulation.nc"
     )
 
 

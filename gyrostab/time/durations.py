@@ -203,7 +203,9 @@ def averaging_factors(
             "or a list such as 0.1s,1s"
         )
     if is_number:
-        return _spaced_factors(int(taus), limit)
+        if taus >= 2 * limit * np.log(limit) + 2:  # spaced by less than half a sample everywhere
+            return np.arange(1, limit + 1, dtype=np.int64)
+        return np.unique(np.round(np.geomspace(1, limit, int(taus))).astype(np.int64))
     factors = _listed_factors(taus, rate, longest, order)
     if tau_max is not None:  # to the nearest factor, as those of the list
         factors = factors[factors <= round(duration_seconds(tau_max, "tau_max") * rate)]
@@ -231,9 +233,3 @@ def _listed_factors(taus: Any, rate: float, longest: int, order: int) -> NDArray
             )
         ks.append(k)
     return np.unique(np.asarray(ks, dtype=np.int64))
-
-
-def _spaced_factors(count: int, limit: int) -> NDArray[np.int64]:
-    if count >= 2 * limit * np.log(limit) + 2:  # spaced by less than half a sample everywhere
-        return np.arange(1, limit + 1, dtype=np.int64)
-    return np.unique(np.round(np.geomspace(1, limit, count)).astype(np.int64))

@@ -105,9 +105,17 @@ def concatenate_logs(
     name = signal_name(sources[0].log)
     chunk = chunk_of([source.log[name].data for source in sources])
     axes = sorted({axis for source in sources for axis in source.axes})
+    arrays = [
+        [
+            (piece.source.log.variables[name].data, piece.source.axes.index(axis), piece.runs)
+            for piece in pieces
+            if axis in piece.source.axes
+        ]
+        for axis in axes
+    ]
     signal = xr.Variable(
         ("axis", "time"),
-        place_on_grid([_placed_arrays(pieces, name, axis) for axis in axes], size, chunk),
+        place_on_grid(arrays, size, chunk),
         {**sources[0].log[name].attrs, "units": SIGNAL_UNITS[name]},
     )
     signal.encoding = common_packing(source.log[name].encoding for source in sources)
@@ -174,15 +182,6 @@ def _check_same(sources: Sequence[Source]) -> None:
                 f"{source.rate:.10g} Hz; one log has one sampling "
                 "rate: run them one by one, or ingest their source files together"
             )
-
-
-def _placed_arrays(pieces: Sequence[PlacedLog], name: str, axis: str) -> list[Any]:
-    arrays = []
-    for piece in pieces:
-        rows = piece.source.axes
-        if axis in rows:
-            arrays.append((piece.source.log.variables[name].data, rows.index(axis), piece.runs))
-    return arrays
 
 
 def _describe_absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:

@@ -152,15 +152,15 @@ def _own_gaps(piece: PlacedLog) -> Table:
         table = _EMPTY
     for column in (FIRST, END) if len(table) else ():
         table[:, column] = piece.on_grid(table[:, column])
-    return np.concatenate([table, _rate_slips(piece)]) if len(piece.runs) > 1 else table
-
-
-def _rate_slips(piece: PlacedLog) -> Table:
-    """Return the samples left empty or dropped where a different rate has drifted by one sample."""
-    end, own_end = piece.runs[:-1, 0] + piece.runs[:-1, 2], piece.runs[:-1, 1] + piece.runs[:-1, 2]
-    start, own_start = piece.runs[1:, 0], piece.runs[1:, 1]
+    if len(piece.runs) == 1:
+        return table
+    # samples left empty or dropped where a different rate has drifted by one sample
+    runs = piece.runs
+    end, own_end = (runs[:-1, column] + runs[:-1, 2] for column in (0, 1))
+    start, own_start = runs[1:, 0], runs[1:, 1]
     cause = np.where(start > end, MISSING, DUPLICATE)
-    return np.stack([end, start, start - end, own_start - own_end, cause], axis=1)
+    slips = np.stack([end, start, start - end, own_start - own_end, cause], axis=1)
+    return np.concatenate([table, slips])
 
 
 def _missing_in_both(held: Table, new: Table) -> Table:

@@ -61,17 +61,6 @@ def _unusable_cells(
     return np.stack([first, first + rows, rows, rows, np.full_like(rows, cause)], axis=1)
 
 
-def _absent_rows(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
-    """Return the spans of rows without any number, if rows have samples because they count."""
-    if placement.placed <= scanned.rows - scanned.absent - scanned.repeated:
-        return np.empty((0, 2), dtype=np.int64)
-    spans = [
-        find_spans(~scanned.mask(begin, min(begin + BLOCK_ROWS, scanned.rows)), begin)
-        for begin in range(0, scanned.rows, BLOCK_ROWS)
-    ]
-    return merge_spans(spans)
-
-
 def _dropped_rows(events: NDArray[np.int64]) -> NDArray[np.int64]:
     """List the dropped or moved rows; consecutive rows of one cause are one line."""
     rows = events[np.isin(events[:, 0], (DUPLICATE, OUT_OF_ORDER))]
@@ -87,11 +76,18 @@ def _dropped_rows(events: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def find_gaps(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
     """Make the table of all gaps in samples, with the columns of `ingest.gap_table.COLUMNS`."""
+    unreadable = [scanned.unreadable]
+    if placement.placed > scanned.rows - scanned.absent - scanned.repeated:
+        # rows without any number have samples too, because they count
+        absent = [
+            find_spans(~scanned.mask(begin, min(begin + BLOCK_ROWS, scanned.rows)), begin)
+            for begin in range(0, scanned.rows, BLOCK_ROWS)
+        ]
+        unreadable.append(merge_spans(absent))
     table = np.concatenate(
         [
             _missing_samples(placement, scanned),
-            _unusable_cells(_absent_rows(placement, scanned), UNREADABLE, placement),
-            _unusable_cells(scanned.unreadable, UNREADABLE, placement),
+            *(_unusable_cells(spans, UNREADABLE, placement) for spans in unreadable),
             _unusable_cells(scanned.infinite, OUTSIDE_RANGE, placement),
             _dropped_rows(placement.events),
         ]

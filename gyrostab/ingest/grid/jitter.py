@@ -178,19 +178,15 @@ def _fit_lines(
     observed: list[Block], length: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Fit lines to stretches of `length` stamps: slopes [ns a row], residual sigma [ns]."""
-    tables = []
-    for count, stamps in observed:
-        if len(count) >= length:
-            first = np.arange(0, len(count) - length + 1, length // 2)
-            at = first[:, None] + np.arange(length)
-            tables.append(
-                np.stack([count[at] - count[first, None], stamps[at] - stamps[first, None]]).astype(
-                    np.float64
-                )
-            )
+    tables = [
+        np.lib.stride_tricks.sliding_window_view(np.stack(block), length, axis=1)[:, :: length // 2]
+        for block in observed
+        if len(block[0]) >= length
+    ]
     if not tables:
         return None
-    count, stamps = np.concatenate(tables, axis=1)
+    table = np.concatenate(tables, axis=1)
+    count, stamps = (table - table[:, :, :1]).astype(np.float64)
     count -= count.mean(axis=1, keepdims=True)
     stamps -= stamps.mean(axis=1, keepdims=True)
     slope = (count * stamps).sum(axis=1) / (count**2).sum(axis=1)
@@ -254,9 +250,8 @@ def _refine_model(
             return None
         period = float(ct / cc)
         sigma = 1.4826 * float(np.median(np.abs(np.concatenate(offs))))
-        lost = np.concatenate(losses)
-        nats += len(lost) * _loss_entropy(lost) - _loss_cost(lost, loss_nats)
-        loss_nats = _fit_loss_nats(lost)
+        correction, loss_nats = _price_losses(np.concatenate(losses), loss_nats)
+        nats += correction
         if not abs(period / jitter.period - 1) < most_off or sigma > 2 * _MAX_SIGMA:
             return None
     fits = (
@@ -268,22 +263,18 @@ def _refine_model(
     return JitterModel(period, sigma, jitter.observe, jitter.group, nats / rows, loss_nats, fits)
 
 
-def _loss_entropy(lost: Integers) -> float:
-    """Return the mean code length of the samples lost before each row [nats]."""
+def _price_losses(lost: Integers, loss_nats: float) -> tuple[float, float]:
+    """Return corrections of the cost of samples lost before each row, and of a loss [nats].
+
+    The first is the code length of all losses less their cost in the search for the sequence of
+    samples; the second cost follows from the share of rows after losses.
+    """
     shares = np.unique(lost, return_counts=True)[1] / max(1, len(lost))
-    return -float(shares @ np.log(shares))
-
-
-def _loss_cost(lost: Integers, loss_nats: float) -> float:
-    """Return the cost of losses in the search for the sequence of samples [nats]."""
-    lost = lost[lost > 0]
-    return loss_nats * len(lost) + float(np.log(lost).sum())
-
-
-def _fit_loss_nats(lost: Integers) -> float:
-    """Return the cost of a loss that follows from the share of rows after losses [nats]."""
-    share = float(np.clip(np.mean(lost > 0) if len(lost) else 0.0, 1e-9, 0.5))
-    return min(LOSS_NATS, float(np.log((1 - share) / share)))
+    found = lost[lost > 0]
+    cost = loss_nats * len(found) + float(np.log(found).sum())
+    share = float(np.clip(len(found) / max(1, len(lost)), 1e-9, 0.5))
+    correction = -len(lost) * float(shares @ np.log(shares)) - cost
+    return correction, min(LOSS_NATS, float(np.log((1 - share) / share)))
 
 
 def _is_near(off: NDArray[np.float64], sigma: float) -> NDArray[np.bool_]:

@@ -128,7 +128,7 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
     finer = None if counted else finer_period(parts, period)
     lost = None if finer is None else _estimate_sharp(stamps, parts, SECOND / finer)
     if lost is not None:
-        return replace(lost, even=_mean_rate(parts))
+        return replace(lost, even=float(f"{SECOND / time_per_row(stretches):.4g}"))
     if (
         counted
         or step_scatter(steps, period) > _SHARP_SCATTER
@@ -175,8 +175,7 @@ def _estimate_with_jitter(
 ) -> RateEstimate:
     """Estimate the rate along the sequence of samples of jittered stamps."""
     longest = sure * jitter.period * max(1.0, jitter.group)
-    estimate = _estimate_pooled(stamps, jitter.period, longest, jitter=jitter)
-    return replace(estimate, coarse=coarse, jitter=jitter)
+    return _estimate_pooled(stamps, jitter.period, longest, coarse=coarse, jitter=jitter)
 
 
 def _finer_rate(
@@ -192,14 +191,6 @@ def _finer_rate(
     if best is None or best.period > 0.9 * jitter.period or best.code_length > jitter.code_length:
         return None
     return float(f"{SECOND / best.period:.4g}")
-
-
-def _mean_rate(parts: Parts) -> float:
-    """Return the median number of rows a second of stretches."""
-    rates = [
-        SECOND * (len(part) - 1) / (part[-1] - part[0]) for part in parts if part[-1] > part[0]
-    ]
-    return float(f"{np.median(rates):.4g}")
 
 
 def _sample_stamps(
@@ -236,6 +227,7 @@ def _estimate_pooled(
         counted,
         coarse,
         rate,
+        jitter=jitter,
     )
 
 

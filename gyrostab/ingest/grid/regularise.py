@@ -60,8 +60,12 @@ def _is_on_grid(channel: Any, n_filled: int, scanned: ScanPass, placement: Place
     if scanned.absent <= _MAX_UNPLACED_SHARE * n_filled:
         return True  # without reading the channel
     dropped = max(0, present - placement.placed)  # they lose their channels too
-    unplaced = n_filled - count_placed(channel, placement)
-    return unplaced - dropped <= _MAX_UNPLACED_SHARE * n_filled
+    placed = 0
+    for begin in range(0, channel.shape[0], BLOCK_ROWS):
+        block = read_slice(channel, begin, min(begin + BLOCK_ROWS, channel.shape[0]))
+        rows = np.flatnonzero(np.isfinite(block)) + begin
+        placed += int(np.count_nonzero(placement.samples_of(rows) >= 0))
+    return n_filled - placed - dropped <= _MAX_UNPLACED_SHARE * n_filled
 
 
 def _place_channels(
@@ -271,16 +275,6 @@ def rows_on_grid(
         most_in_memory=MAX_PLAIN_NUMBERS,
         convert=partial(_scale_samples, scale=scale, unit=unit),
     )
-
-
-def count_placed(channel: Any, placement: Placement) -> int:
-    """Count the rows with a sample in which a channel has a value."""
-    count = 0
-    for begin in range(0, channel.shape[0], BLOCK_ROWS):
-        end = min(begin + BLOCK_ROWS, channel.shape[0])
-        rows = np.flatnonzero(np.isfinite(read_slice(channel, begin, end))) + begin
-        count += int(np.count_nonzero(placement.samples_of(rows) >= 0))
-    return count
 
 
 def gather_channel(
