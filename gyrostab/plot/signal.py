@@ -100,7 +100,11 @@ def plot_signal(
         panel.set_ylabel(
             f"{channel.replace('_', ' ')}\n{unit_label(log[channel].attrs.get('units'))}".rstrip()
         )
-    _shade_gaps(list(panels), log, columns)
+    starts, ends = _find_gaps(log, columns)
+    if starts.size:
+        for panel in panels:
+            shade_spans(panel, starts, ends, label="gap: no samples")
+        panels[0].legend(loc="upper right", framealpha=0.9)
     signal_text = "Rotation rate" if name == "rate" else "Rotation angle"
     rate = log.attrs.get("sampling_rate_hz")
     title_figure(figure, f"{signal_text} as recorded", f"{float(rate):g} Hz" if rate else "")
@@ -156,15 +160,6 @@ def _draw_trace(panel: Axes, values: xr.DataArray, colour: str, columns: int) ->
             np.repeat(times, 2), np.stack([low, high], axis=1).ravel(), color=colour, linewidth=0.7
         )
     panel.grid(alpha=0.3)
-
-
-def _shade_gaps(panels: list[Axes], log: xr.Dataset, columns: int) -> None:
-    starts, ends = _find_gaps(log, columns)
-    if not starts.size:
-        return
-    for panel in panels:
-        shade_spans(panel, starts, ends, label="gap: no samples")
-    panels[0].legend(loc="upper right", framealpha=0.9)
 
 
 def _find_gaps(log: xr.Dataset, columns: int) -> tuple[NDArray[Any], NDArray[Any]]:

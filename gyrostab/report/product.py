@@ -200,16 +200,13 @@ def _list_facts(product: xr.Dataset) -> list[tuple[str, str]]:
         for name, label in plain.items()
         if name in attrs
     ]
-    shares = [f"{label}: {format_share(share)}" for label, share in _estimator_shares(product)]
-    return [*facts, ("Cells of the surface", ", ".join(shares))]
-
-
-def _estimator_shares(product: xr.Dataset) -> list[tuple[str, float]]:
     labels = ("no estimate", "from complete clusters", "from incomplete (weighted) clusters")
-    counts = np.bincount(
-        np.asarray(product["estimator"].values, dtype=np.int64).ravel(), minlength=len(labels)
-    )
-    return [(label, float(counts[number] / counts.sum())) for number, label in enumerate(labels)]
+    estimator = product["estimator"].values
+    shares = [
+        f"{label}: {format_share(float(np.mean(estimator == number)))}"
+        for number, label in enumerate(labels)
+    ]
+    return [*facts, ("Cells of the surface", ", ".join(shares))]
 
 
 def _list_gaps(log: xr.Dataset) -> list[dict[str, Any]]:

@@ -97,15 +97,14 @@ def window_data(product: xr.Dataset) -> str:
         "times": [str(time).replace("T", " ") for time in part["time"].values.astype("M8[s]")],
         "tau": part["tau"].values.tolist(),
         "values": [
-            {key: _encode_floats(np.sqrt(values[row])) for key, values in squares.items()}
+            {
+                key: base64.b64encode(np.sqrt(values[row]).astype("<f4").tobytes()).decode("ascii")
+                for key, values in squares.items()
+            }
             for row in range(len(names))
         ],
     }
     return embeddable(json.dumps(content))
-
-
-def _encode_floats(values: NDArray[np.float64]) -> str:
-    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode("ascii")
 
 
 def _thin_product(product: xr.Dataset, windows: int, taus: int) -> xr.Dataset:

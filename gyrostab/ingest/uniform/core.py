@@ -30,6 +30,13 @@ from gyrostab.store.private import close_function
 from gyrostab.time.grid import TimeGridIndex, grid_index, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
 
+Table = NDArray[np.int64]
+
+#: Largest variable that stays in memory after placing [numbers]; 16 MB.
+SMALL_SIZE = 2**21
+#: Chunk length of variables that were in memory [samples].
+CHUNK_SAMPLES = 2**20
+
 
 def as_uniform(log: xr.Dataset) -> xr.Dataset:
     """Place a log on the uniform time axis of its stamps.
@@ -173,15 +180,7 @@ def _with_true_table(
     return with_table(log, fitting, grid.start, grid.rate)
 
 
-Runs = NDArray[np.int64]
-
-#: Largest variable that stays in memory after placing [numbers]; 16 MB.
-SMALL_SIZE = 2**21
-#: Chunk length of variables that were in memory [samples].
-CHUNK_SAMPLES = 2**20
-
-
-def place_samples(log: xr.Dataset, runs: Runs, start: int, rate: float, size: int) -> xr.Dataset:
+def place_samples(log: xr.Dataset, runs: Table, start: int, rate: float, size: int) -> xr.Dataset:
     """Place the variables along ``time`` of a log on a grid; lazy ones stay lazy.
 
     `runs` (n, 3) are first sample of the grid, first sample of the log, length; `start` and `rate`
@@ -217,9 +216,6 @@ def place_samples(log: xr.Dataset, runs: Runs, start: int, rate: float, size: in
         note = f"left out, as missing samples of it could not be marked: {', '.join(left_out)}"
         placed_log = placed_log.assign_attrs(notes=[*texts(log, "notes"), note])
     return placed_log
-
-
-Table = NDArray[np.int64]
 
 
 def _change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate: float) -> Table:
