@@ -120,14 +120,16 @@ def cut_log(
         raise OptionError(f"{named} leaves no sample of the log; {clock.describe()}")
     given = [clock.span_of(span, low, high) for span in spans]
     excluded = merge_spans([np.array([span]) for span in given if span[1] > span[0]])
-    runs = _kept_runs(low, high, excluded)
-    if not len(runs):
+    kept = np.concatenate([[low], excluded.ravel(), [high]]).reshape(-1, 2)
+    kept = kept[kept[:, 1] > kept[:, 0]]
+    if not len(kept):
         raise OptionError(f"--exclude leaves nothing of the log; {clock.describe()}")
     start, size = int(grid_times(grid.start, grid.rate, low)), high - low
+    runs = np.stack([kept[:, 0] - low, kept[:, 0], kept[:, 1] - kept[:, 0]], axis=1)
     part = _cut_samples(log, runs, start, grid, low, size)
-    part = _cut_channels(part, grid, low, high, excluded)
+    part = _cut_channels(part, grid_times(grid.start, grid.rate, kept.ravel()))
     if "gap" in log.dims or len(excluded):
-        part = with_table(part, _cut_table(log, grid, low, high, excluded), start, grid.rate)
+        part = with_table(part, _cut_table(log, grid, low, kept, excluded), start, grid.rate)
     options = [
         *([f"from {time_from}"] if time_from is not None else []),
         *([f"to {time_to}"] if time_to is not None else []),
@@ -217,14 +219,6 @@ class _Clock:
         return max(first, low), min(end, high)
 
 
-def _kept_runs(low: int, high: int, excluded: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the runs (sample of the part, sample of the log, length) between excluded spans."""
-    first = np.concatenate([[low], excluded[:, 1]])
-    end = np.concatenate([excluded[:, 0], [high]])
-    is_nonempty = end > first
-    return np.stack([first - low, first, end - first], axis=1)[is_nonempty]
-
-
 def _cut_samples(
     log: xr.Dataset, runs: NDArray[np.int64], start: int, grid: UniformGrid, low: int, size: int
 ) -> xr.Dataset:
@@ -239,30 +233,27 @@ def _cut_samples(
     return place_samples(log, runs, start, grid.rate, size)
 
 
-def _cut_channels(
-    part: xr.Dataset, grid: UniformGrid, low: int, high: int, excluded: NDArray[np.int64]
-) -> xr.Dataset:
-    """Cut the channels with separate time coordinates."""
-    edges = grid_times(grid.start, grid.rate, np.concatenate([[low, high], excluded.ravel()]))
+def _cut_channels(part: xr.Dataset, edges: NDArray[np.int64]) -> xr.Dataset:
+    """Cut the channels with separate time coordinates to kept spans, whose `edges` are in order."""
     for dim in [dim for dim in part.dims if str(dim).startswith("time_") and dim in part.coords]:
         stamps = to_nanoseconds(part.variables[dim].values)
-        keep = (stamps >= edges[0]) & (stamps < edges[1])
-        for first, end in edges[2:].reshape(-1, 2):
-            keep &= (stamps < first) | (stamps >= end)
+        keep = np.searchsorted(edges, stamps, side="right") % 2 == 1
         if not keep.all():
             part = part.isel({dim: np.flatnonzero(keep)})
     return part
 
 
 def _cut_table(
-    log: xr.Dataset, grid: UniformGrid, low: int, high: int, excluded: NDArray[np.int64]
+    log: xr.Dataset,
+    grid: UniformGrid,
+    low: int,
+    kept: NDArray[np.int64],
+    excluded: NDArray[np.int64],
 ) -> NDArray[np.int64]:
     table = read_gaps(log, grid.start, grid.rate) if "gap" in log.dims else None
-    pieces = [np.empty((0, 5), dtype=np.int64)]
-    edges = [low, *excluded.ravel().tolist(), high]
-    for first, end in zip(edges[::2], edges[1::2], strict=True):
-        if table is not None and end > first:
-            pieces.append(clip_table(table, first, end))
+    if table is None:
+        table = np.empty((0, 5), dtype=np.int64)
+    pieces = [clip_table(table, first, end) for first, end in kept.tolist()]
     cut = add_spans(np.concatenate(pieces), excluded, OUTSIDE_RANGE)
     cut[:, :2] -= low
     return cut
