@@ -270,9 +270,9 @@ def _price_losses(lost: Integers, loss_nats: float) -> tuple[float, float]:
     samples; the second cost follows from the share of rows after losses.
     """
     shares = np.unique(lost, return_counts=True)[1] / max(1, len(lost))
-    found = lost[lost > 0]
-    cost = loss_nats * len(found) + float(np.log(found).sum())
-    share = float(np.clip(len(found) / max(1, len(lost)), 1e-9, 0.5))
+    gaps = lost[lost > 0]
+    cost = loss_nats * len(gaps) + float(np.log(gaps).sum())
+    share = float(np.clip(len(gaps) / max(1, len(lost)), 1e-9, 0.5))
     correction = -len(lost) * float(shares @ np.log(shares)) - cost
     return correction, min(LOSS_NATS, float(np.log((1 - share) / share)))
 

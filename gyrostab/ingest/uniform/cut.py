@@ -120,16 +120,18 @@ def cut_log(
         raise OptionError(f"{named} leaves no sample of the log; {clock.describe()}")
     given = [clock.span_of(span, low, high) for span in spans]
     excluded = merge_spans([np.array([span]) for span in given if span[1] > span[0]])
-    kept = np.concatenate([[low], excluded.ravel(), [high]]).reshape(-1, 2)
-    kept = kept[kept[:, 1] > kept[:, 0]]
-    if not len(kept):
+    kept_spans = np.concatenate([[low], excluded.ravel(), [high]]).reshape(-1, 2)
+    kept_spans = kept_spans[kept_spans[:, 1] > kept_spans[:, 0]]
+    if not len(kept_spans):
         raise OptionError(f"--exclude leaves nothing of the log; {clock.describe()}")
     start, size = int(grid_times(grid.start, grid.rate, low)), high - low
-    runs = np.stack([kept[:, 0] - low, kept[:, 0], kept[:, 1] - kept[:, 0]], axis=1)
+    runs = np.stack(
+        [kept_spans[:, 0] - low, kept_spans[:, 0], kept_spans[:, 1] - kept_spans[:, 0]], axis=1
+    )
     part = _cut_samples(log, runs, start, grid, low, size)
-    part = _cut_channels(part, grid_times(grid.start, grid.rate, kept.ravel()))
+    part = _cut_channels(part, grid_times(grid.start, grid.rate, kept_spans.ravel()))
     if "gap" in log.dims or len(excluded):
-        part = with_table(part, _cut_table(log, grid, low, kept, excluded), start, grid.rate)
+        part = with_table(part, _cut_table(log, grid, low, kept_spans, excluded), start, grid.rate)
     options = [
         *([f"from {time_from}"] if time_from is not None else []),
         *([f"to {time_to}"] if time_to is not None else []),
@@ -247,13 +249,13 @@ def _cut_table(
     log: xr.Dataset,
     grid: UniformGrid,
     low: int,
-    kept: NDArray[np.int64],
+    kept_spans: NDArray[np.int64],
     excluded: NDArray[np.int64],
 ) -> NDArray[np.int64]:
     table = read_gaps(log, grid.start, grid.rate) if "gap" in log.dims else None
     if table is None:
         table = np.empty((0, 5), dtype=np.int64)
-    pieces = [clip_table(table, first, end) for first, end in kept.tolist()]
+    pieces = [clip_table(table, first, end) for first, end in kept_spans.tolist()]
     cut = add_spans(np.concatenate(pieces), excluded, OUTSIDE_RANGE)
     cut[:, :2] -= low
     return cut
