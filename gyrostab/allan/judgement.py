@@ -123,17 +123,20 @@ def judge_product(product: xr.Dataset) -> list[str]:
 
 
 def _judge_sampling(product: xr.Dataset) -> str:
-    """Say from when on the samples come at another rate than the log states, or return ""."""
+    """Say where the samples come at another rate than the log states, or return ""."""
     half_window = np.timedelta64(round(0.5e9 * product.attrs.get("window_s", 0.0)), "ns")
-    end = product["time"].values.max() + half_window
-    changes = [text for text in texts(product, "rate_changes") if np.datetime64(text) < end]
-    if not changes:
-        return ""
-    return (
-        f"N cannot be judged: from {min(changes)[:19].replace('T', ' ')} on the samples come at "
-        f"another rate than {product.attrs['sampling_rate_hz']:.6g} Hz, so their times and "
-        "coefficients are wrong; split the log there and run the parts separately."
-    )
+    times = product["time"].values
+    changes = texts(product, "rate_changes")
+    for begin, end in zip(changes[::2], changes[1::2], strict=True):
+        first, last = np.datetime64(begin), np.datetime64(end)
+        if first < times.max() + half_window and last > times.min() - half_window:
+            span = " to ".join(text[:19].replace("T", " ") for text in (begin, end))
+            return (
+                f"N cannot be judged: from {span} the samples come at another rate than "
+                f"{product.attrs['sampling_rate_hz']:.6g} Hz, so their times and coefficients are "
+                "wrong; split the log there and run the parts separately."
+            )
+    return ""
 
 
 def _compare_channels(

@@ -16,7 +16,7 @@ from gyrostab.ingest.gap_table import (
 )
 from gyrostab.ingest.grid.jitter import MIN_SIGMA
 from gyrostab.ingest.grid.place import Placement
-from gyrostab.ingest.grid.rate import RateEstimate
+from gyrostab.ingest.grid.rate import DeviatingStretch, RateEstimate
 from gyrostab.ingest.grid.scan_pass import ScanPass, file_of, record_name
 from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER
 from gyrostab.schema import log_channels
@@ -101,7 +101,7 @@ def describe_rate(
     raw: xr.Dataset,
     estimate: RateEstimate,
     rate: float,
-    deviating: list[tuple[int, int, float]],
+    deviating: list[DeviatingStretch],
     placement: Placement,
 ) -> list[str]:
     """Return notes on the sampling rate."""
@@ -156,13 +156,13 @@ def describe_rate(
             f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million "
             f"from {rate:.10g} Hz"
         )
-    for row, stamp, own_rate in deviating[:_MAX_NAMED]:
-        file, local = file_of(raw, row)
+    for stretch in deviating[:_MAX_NAMED]:
+        (file, first), (_, last) = (file_of(raw, row) for row, _ in (stretch.first, stretch.last))
+        begin, end = (format_stamp(stamp) for _, stamp in (stretch.first, stretch.last))
         notes.append(
-            f"{file}: from about {format_stamp(stamp)} (row {local}) the samples come at "
-            f"{own_rate:.6g} Hz and not at {rate:.6g} Hz; "
-            "by their stamps samples are missing or dropped there; split the log at that row and "
-            "run the parts separately"
+            f"{file}: from about {begin} (row {first}) to {end} (row {last}) the samples come at "
+            f"{stretch.rate:.6g} Hz and not at {rate:.6g} Hz; by their stamps samples are missing "
+            "or dropped there; split the log at these rows and run the parts separately"
         )
     return notes
 

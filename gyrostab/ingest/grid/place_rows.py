@@ -24,6 +24,7 @@ from gyrostab.ingest.grid.place import (
 )
 from gyrostab.ingest.grid.place_in_order import place_in_order
 from gyrostab.ingest.grid.rate import (
+    DeviatingStretch,
     RateEstimate,
     deviating_stretches,
     estimate_near,
@@ -106,7 +107,7 @@ class RowPlacer:
                 notes.append(note)
             # a given rate settles the question
             rate, estimate = declared, replace(estimate, finer=None, even=None)
-        deviating: list[tuple[int, int, float]] = []
+        deviating: list[DeviatingStretch] = []
         if estimate.counted:
             counted = partial(stamp_blocks, raw, scanned, all_rows=count_all_rows)
             placement = place_by_count(counted, estimate, rate, max_gap=self.max_gap)
@@ -115,7 +116,7 @@ class RowPlacer:
             if _is_sharp(estimate.jitter):
                 deviating = deviating_stretches(stamps, 1e9 / rate)
         notes += describe_rate(raw, estimate, rate, deviating, placement)
-        changes = tuple(stamp for _, stamp, _ in deviating)
+        changes = tuple(end[1] for stretch in deviating for end in stretch[:2])
         return replace(placement, rate_changes=changes), rate, notes
 
     def _place_without_time(self) -> tuple[Placement, float, list[str]]:

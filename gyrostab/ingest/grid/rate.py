@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -300,12 +301,20 @@ def _estimate_sharp(stamps: Stamps, parts: Parts, rate: float) -> RateEstimate |
 _STRETCH = 1024  # stretch whose rate is compared with that of the log [stamps]
 
 
-def deviating_stretches(stamps: Stamps, period: float) -> list[tuple[int, int, float]]:
-    """Find stretches whose rate deviates by more than 2 %: first row, its stamp [ns], rate [Hz].
+class DeviatingStretch(NamedTuple):
+    """Rows whose stamps say another rate than that of the log."""
+
+    first: tuple[int, int]  # row, and its stamp [ns]
+    last: tuple[int, int]
+    rate: float  # where it begins [Hz]
+
+
+def deviating_stretches(stamps: Stamps, period: float) -> list[DeviatingStretch]:
+    """Find stretches whose rate deviates by more than 2 % from one over `period` [ns].
 
     Only steps of another length count as a deviation, not missing or doubled rows.
     """
-    stretches: list[tuple[int, int, float]] = []
+    stretches: list[DeviatingStretch] = []
     inside = False
     for rows, values in recut_blocks(stamps, 64 * _STRETCH):
         is_readable = values != NO_STAMP
@@ -319,8 +328,14 @@ def deviating_stretches(stamps: Stamps, period: float) -> list[tuple[int, int, f
             part = values[begin : begin + _STRETCH]
             own_period = period_of_lines([part]) if is_suspect else None
             is_deviating = own_period is not None and abs(own_period / period - 1) > 0.02
-            if is_deviating and not inside and own_period is not None:
-                stretches.append((int(rows[begin]), int(part[0]), SECOND / own_period))
+            if is_deviating and own_period is not None:
+                last = begin + len(part) - 1
+                end = int(rows[last]), int(part[-1])
+                if inside:
+                    stretches[-1] = stretches[-1]._replace(last=end)
+                else:
+                    first = int(rows[begin]), int(part[0])
+                    stretches.append(DeviatingStretch(first, end, SECOND / own_period))
             inside = is_deviating
     return stretches
 
