@@ -162,6 +162,7 @@ _SIGNATURES = {
 }
 _LISTED = {
     "rate": "deg/h, arcsec/s, deg/s, rad/s, mrad/s, urad/s, nrad/s, rpm",
+    "rotation_rate": "deg/s, rad/s, mrad/s, urad/s, nrad/s, rpm, deg/h, arcsec/s",
     "angle": "deg, arcsec, rad, mrad, urad",
     "acceleration": "g, mg, m/s^2",
 }
@@ -214,7 +215,13 @@ def parse_unit(text: str, quantity: str | None = None) -> Unit:
     'acceleration'
     >>> parse_unit("DEG/HR").factor, parse_unit("G", "acceleration").quantity
     (1.0, 'acceleration')
+    >>> parse_unit("rpm", "rotation_rate").factor
+    6.0
     """
+    if quantity == "rotation_rate":  # in the units of rates
+        unit = parse_unit(text, "rate")
+        is_rate = unit.quantity == "rate"
+        return Unit(text, quantity, unit.factor / HOUR) if is_rate else unit
     definition = _find_unit(text, quantity)
     if definition is not None:
         return Unit(text, *definition)

@@ -1,8 +1,8 @@
-"""Combine several files into one raw log: order, axes and channels of all, channel files."""
+"""Combine several files into one raw log: order, repeated rows, axes and channels of all."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -12,13 +12,22 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
 from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Spool
+from gyrostab.ingest.columns.stamps import NAT, read_stamps
 from gyrostab.ingest.concat.core import absence_notes, check_units, merge_notes
 from gyrostab.ingest.concat.grid import group_axes, split_axes
-from gyrostab.ingest.overlap import drop_repeats, first_known_stamp, stamp_span
+from gyrostab.ingest.concat.place import COMPARED_SAMPLES, match_ends
 from gyrostab.schema import SIGNAL_UNITS
-from gyrostab.store.lazy import concatenate_columns, make_dask, select_part, stack_rows
+from gyrostab.store.lazy import (
+    concatenate_columns,
+    make_dask,
+    read_slice,
+    select_part,
+    stack_rows,
+)
 from gyrostab.store.write import common_packing
 from gyrostab.wording import list_some
+
+_BLOCK_ROWS = 2**20
 
 
 def memory_bytes(part: xr.Dataset) -> int:
@@ -72,7 +81,7 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
         apart = [
             part[names] for part, names in zip(split_parts, slow_channels, strict=True) if names
         ]
-        joined = with_channels(joined, apart)
+        joined = attach_channels(joined, apart)
     if joined.sizes["row"] < 2:
         name = joined.attrs["source_files"][0]
         raise FormatError(f"{name}: there is only one row of data; a log needs at least two")
@@ -200,22 +209,11 @@ def _files_without(groups: list[list[xr.Dataset]], holders: set[int]) -> list[st
     ]
 
 
-def with_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Add channels of other tables of the same files, each on ``time_<channel>``."""
-    return (
-        attach_channels(log, sources).drop_attrs(deep=False).assign_attrs(log.attrs)
-        if sources
-        else log
-    )
-
-
 def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
     """Add the channels of other files, each on ``time_<channel>`` with its filled rows only."""
     pieces: dict[str, list[tuple[NDArray[Any], NDArray[Any], str]]] = {}
-    files: list[str] = []
-    for source in sources:
-        name = source.attrs["source_files"][0]
-        files.append(name)
+    files = [source.attrs["source_files"][0] for source in sources]
+    for name, source in zip(files, sources, strict=True):
         for channel, stamps, values, units in _read_channels(source, name):
             if channel in log.variables:
                 fix = (
@@ -235,9 +233,6 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
         log = log.assign_coords({dim: (dim, np.concatenate(stamps)[order])}).assign(
             {channel: (dim, np.concatenate(values)[order], {"units": units[0]})}
         )
-    if files:
-        notes = [note for source in sources for note in source.attrs.get("notes", [])]
-        log = log.assign_attrs(notes=[*log.attrs.get("notes", []), *notes], channel_files=files)
     return log
 
 
@@ -268,3 +263,99 @@ def _read_channels(
             f"--channel {name}: it holds no channel with a unit; give one with --unit NAME=UNIT"
         )
     return channels
+
+
+def drop_repeats(parts: Sequence[xr.Dataset], signal: str) -> list[xr.Dataset]:
+    """Drop the rows of each file that repeat rows of earlier files, with notes.
+
+    Two files overlap if rows of both have the same stamps and the same values. Files whose clocks
+    merely cover the same hours, as after a restart of the clock, have other values and stay
+    unchanged. `parts` are in the order of their first stamps. A file without new rows is dropped as
+    a whole. The notes are in the file that contains the rows.
+    """
+    kept_parts: list[tuple[xr.Dataset, int]] = []  # with the latest stamp of each
+    for part in parts:
+        first, end = stamp_span(part)
+        for place, (held, held_end) in reversed(list(enumerate(kept_parts))):
+            if first > held_end:
+                continue
+            tail, head = _rows_from(held, first), _rows_until(part, held_end)
+            if not _is_copy(held, part, signal, tail, head):
+                continue
+            if head > held.sizes["row"] - tail and end >= held_end:
+                # it contains rows that the earlier file lost
+                held, part = _drop_rows(held, slice(0, tail), part)
+                held_end = first - 1
+            else:
+                part, held = _drop_rows(part, slice(head, None), held)
+                first, end = stamp_span(part)
+            kept_parts[place] = held, held_end
+        kept_parts = [(log, last) for log, last in [*kept_parts, (part, end)] if log.sizes["row"]]
+    return [log for log, _ in kept_parts]
+
+
+def _drop_rows(part: xr.Dataset, rows: slice, other: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+    """Keep the given rows of `part`; add a note on the others to `other`, which contains them."""
+    name, holder = (str(log.attrs["source_files"][0]) for log in (part, other))
+    shorter = part.isel(row=rows)
+    left_out = part.sizes["row"] - shorter.sizes["row"]
+    note = f"{holder}: {left_out} rows of {name} are here too, and are left out there"
+    return shorter, other.assign_attrs(notes=[*other.attrs["notes"], note])
+
+
+def _stamp_blocks(part: xr.Dataset) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    """Yield the stamps of a raw log [ns since 1970] in blocks, with the first row of each."""
+    for begin in range(0, part.sizes["row"], _BLOCK_ROWS):
+        yield begin, read_stamps(part, begin, begin + _BLOCK_ROWS)
+
+
+def first_known_stamp(part: xr.Dataset) -> int:
+    """Return the first stamp of a raw log [ns since 1970]; the largest integer without any."""
+    known = (stamps[stamps != NAT] for _, stamps in _stamp_blocks(part))
+    return next((int(stamps[0]) for stamps in known if stamps.size), int(np.iinfo(np.int64).max))
+
+
+def stamp_span(part: xr.Dataset) -> tuple[int, int]:
+    """Return the first and the latest stamp of a raw log [ns since 1970]."""
+    latest = max((int(stamps.max()) for _, stamps in _stamp_blocks(part)), default=NAT)
+    return first_known_stamp(part), latest  # NAT is the smallest integer
+
+
+def _rows_from(part: xr.Dataset, first: int) -> int:
+    """Return the row from which all stamps are `first` or later."""
+    early = (
+        (begin, np.flatnonzero((stamps < first) & (stamps != NAT)))
+        for begin, stamps in _stamp_blocks(part)
+    )
+    return max((begin + int(rows[-1]) + 1 for begin, rows in early if rows.size), default=0)
+
+
+def _rows_until(part: xr.Dataset, last: int) -> int:
+    """Return the number of rows before the first stamp later than `last`."""
+    late = ((begin, np.flatnonzero(stamps > last)) for begin, stamps in _stamp_blocks(part))
+    return next((begin + int(rows[0]) for begin, rows in late if rows.size), part.sizes["row"])
+
+
+def _is_copy(held: xr.Dataset, part: xr.Dataset, signal: str, tail: int, head: int) -> bool:
+    """Return whether the first `head` rows of `part` repeat those of `held` from `tail` on."""
+    most, size = COMPARED_SAMPLES, held.sizes["row"]
+    ends = [
+        ((tail, tail + most), (0, min(head, most))),
+        ((max(tail, size - most), size), (max(0, head - most), head)),
+    ]
+    return match_ends(_read_common((held, part), signal, spans) for spans in ends).alike
+
+
+def _read_common(
+    parts: tuple[xr.Dataset, xr.Dataset], signal: str, spans: Sequence[tuple[int, int]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Read the signal (axis, row) of two files on their common axes at their common stamps."""
+    ours, theirs = (read_stamps(part, *span) for part, span in zip(parts, spans, strict=True))
+    stamps, *rows = np.intersect1d(ours, theirs, return_indices=True)
+    our_axes, their_axes = (part["axis"].values for part in parts)
+    _, *axes = np.intersect1d(our_axes, their_axes, return_indices=True)
+    held, new = (
+        read_slice(part[signal].data, *span)[axis][:, row[stamps != NAT]]
+        for part, span, axis, row in zip(parts, spans, axes, rows, strict=True)
+    )
+    return held, new

@@ -24,6 +24,7 @@ from gyrostab.ingest.columns.headers import (
     TEMPERATURE_PATTERN,
     is_unit,
     is_unit_of,
+    quantity_of,
 )
 from gyrostab.ingest.guess_time import (
     TYPICAL_RATE_HZ,
@@ -142,7 +143,10 @@ def guess_columns(
         )
     axis_keys = {column.key for column in axes.values()}
     temperatures = [c for c in inspection.columns if c.key not in axis_keys and _is_temperature(c)]
-    is_named = any(column.quantity == "temperature" for column in inspection.columns)
+    is_named = any(
+        column.role == "channel" and quantity_of(column.name) == "temperature"
+        for column in inspection.columns
+    )
     return Guess(
         axes,
         unit,

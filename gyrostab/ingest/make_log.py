@@ -10,18 +10,13 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import MissingUnitError, OptionError, UnitError
-from gyrostab.ingest.columns.headers import (
-    KNOWN_CHANNEL_PATTERN,
-    example_unit,
-    quantity_of,
-    unit_quantity,
-)
+from gyrostab.ingest.columns.headers import KNOWN_CHANNEL_PATTERN, example_unit, quantity_of
 from gyrostab.schema import RESERVED_NAMES, SIGNAL_LONG_NAMES, SIGNAL_UNITS
 from gyrostab.store.lazy import hide_infinite
 from gyrostab.store.write import declare_counts
 from gyrostab.time.grid import check_rate, check_span, time_coordinate
 from gyrostab.time.stamps import stamp_ns
-from gyrostab.units import HOUR, INNER, known_units, parse_unit
+from gyrostab.units import INNER, known_units, parse_unit
 
 
 def make_log(
@@ -139,15 +134,12 @@ def _channel_variable(name: str, channel: Any, size: int) -> xr.Variable:
             f"channel {name!r} has values of shape {values.shape}, and the log {size} samples; "
             "give one value per sample, NaN where it is missing"
         )
-    expected = None if quantity is None else unit_quantity(quantity)
-    unit = parse_unit(text, expected)
-    if expected not in (None, unit.quantity):
-        if KNOWN_CHANNEL_PATTERN.match(name) and expected != "number":  # a ramp has any unit
-            raise UnitError(
-                f"channel {name!r}: {text!r} is a unit of {unit.quantity}, not of {expected}; "
-                f"known are {known_units(expected)}"
-            )
-        quantity = None
-    scale = 1.0 / HOUR if quantity == "rotation_rate" else 1.0
-    converted = np.asarray(values) * (unit.factor * scale) + unit.offset
-    return xr.Variable("time", converted, {"units": INNER[quantity or unit.quantity]})
+    unit = parse_unit(text, quantity)
+    is_named = KNOWN_CHANNEL_PATTERN.match(name) and quantity != "number"  # a ramp has any unit
+    if is_named and quantity is not None and unit.quantity != quantity:
+        raise UnitError(
+            f"channel {name!r}: {text!r} is a unit of {unit.quantity}, not of {quantity}; known "
+            f"are {known_units(quantity)}"
+        )
+    converted = np.asarray(values) * unit.factor + unit.offset
+    return xr.Variable("time", converted, {"units": INNER[unit.quantity]})

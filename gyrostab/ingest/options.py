@@ -77,7 +77,6 @@ class ColumnSummary:
     header: str
     name: str
     role: str  # "time", "gyro", "channel" or "left out"
-    quantity: str | None
     unit: str | None
     key: str = ""  # name for --map
 

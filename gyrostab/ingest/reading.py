@@ -1,7 +1,10 @@
-"""Read paths into one raw log: read the files, order them, add channel files."""
+"""Read paths into one raw log: read the files, leave out damaged ones, add channel files."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,22 +14,30 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OptionError
 from gyrostab.ingest.columns.pieces import SPILL_BYTES, Spool
-from gyrostab.ingest.combine import attach_channels, concatenate, memory_bytes, move_to_disk
+from gyrostab.ingest.combine import (
+    attach_channels,
+    concatenate,
+    memory_bytes,
+    move_to_disk,
+    stamp_span,
+)
 from gyrostab.ingest.concat.core import concatenate_logs
 from gyrostab.ingest.concat.grid import log_span
-from gyrostab.ingest.damaged_files import (
-    add_lost_notes,
-    check_share,
-    find_lost_spans,
-    is_damage,
-    reason_of,
-)
 from gyrostab.ingest.files import expand, read_file, scan_file
 from gyrostab.ingest.options import ReadOptions
-from gyrostab.ingest.overlap import stamp_span
 from gyrostab.ingest.uniform import check_same_rate
 from gyrostab.schema import texts
+from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
+#: Largest share of unreadable files; more suggest a wrong option instead of damage.
+MAX_LOST_SHARE = 0.5
+
+#: Errors of the system that do not concern the single file.
+_SYSTEM = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT, errno.EINTR)
+
+Span = tuple[int, int]
+#: Files that cannot be read, and why.
+LostFiles = Mapping[Path, str]
 #: Called with the number of a file, the number of files and the path.
 OnFile = Callable[[int, int, Path], None]
 #: Reads one file in place of `read_file`.
@@ -136,11 +147,7 @@ def read_log(
             "logs with gyrostab ingest, and then read all of them together"
         )
     channels = [read_file(path, replace(options, channels_only=True, start=None)) for path in extra]
-    spans = (
-        find_lost_spans(lost, _stamp_spans(parts), lambda path: scan_file(path, options))
-        if lost
-        else {}
-    )
+    spans = _find_lost_spans(lost, parts, options) if lost else {}
     if regular:
         log = concatenate_logs(
             [_check_regular(part, path.name, options) for path, part in parts.items()],
@@ -160,7 +167,11 @@ def read_log(
         if spans:
             # regularise marks the gaps there
             log.attrs["unreadable_spans"] = [list(span) for span in spans.values()]
-    return attach_channels(add_lost_notes(log, lost, spans), channels)
+    log = attach_channels(_add_lost_notes(log, lost, spans), channels)
+    if channels:
+        log.attrs["notes"] = [note for part in (log, *channels) for note in texts(part, "notes")]
+        log.attrs["channel_files"] = [part.attrs["source_files"][0] for part in channels]
+    return log
 
 
 def read_channel(
@@ -225,28 +236,22 @@ def _read_all(
         try:
             part = read_one(path, options)
         except (GyrostabError, OSError) as error:
-            if options.strict or len(paths) == 1 or not is_damage(path, error):
+            if options.strict or len(paths) == 1 or not _is_damage(path, error):
                 raise
-            lost[path] = reason_of(path, error)
+            lost[path] = _reason_of(path, error)
             continue
         held += memory_bytes(part)
         if held > SPILL_BYTES and len(paths) > 1:
             held -= memory_bytes(part)
             part = move_to_disk(part, spool)
         parts[path] = part
-    check_share(lost, len(paths))
+    if len(lost) > MAX_LOST_SHARE * len(paths):
+        advice = "that is more than damage: check the names and the reading options"
+        raise FormatError(
+            f"{next(iter(lost.values()))}; {len(lost)} of {len(paths)} files cannot be read, "
+            f"{advice}"
+        )
     return parts, lost
-
-
-def _stamp_spans(parts: Mapping[Path, xr.Dataset]) -> dict[Path, tuple[int, int]]:
-    """Return the first and last stamp [ns since 1970] of the files with stamps."""
-    spans = {}
-    for path, part in parts.items():
-        if "sampling_rate_hz" in part.attrs:
-            spans[path] = log_span(part)
-        elif "time" in part.variables:
-            spans[path] = stamp_span(part)
-    return spans
 
 
 def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Dataset:
@@ -276,3 +281,97 @@ def check_options(parts: Sequence[xr.Dataset]) -> None:
             f"{' and '.join(sorted(unmatched))}: no such column in {files}; the columns are "
             f"{', '.join(headers)}"
         )
+
+
+def _is_damage(path: Path, error: Exception) -> bool:
+    """Return whether an error is due to one damaged or missing file.
+
+    A wrong option, a missing unit, or a system out of disk space, memory or file handles is not.
+    """
+    if path.is_dir() and path.suffix.lower() != ".zarr":
+        return False
+    if isinstance(error, GyrostabError):
+        return isinstance(error, FormatError) and not isinstance(error.__cause__, MemoryError)
+    return isinstance(error, OSError) and error.errno not in _SYSTEM
+
+
+def _reason_of(path: Path, error: Exception) -> str:
+    """Describe what is wrong with a file, in one line that begins with its name."""
+    if isinstance(error, OSError) and not isinstance(error, GyrostabError):
+        return f"{path.name}: cannot be read ({error.strerror or error})"
+    text = " ".join(str(error).split())
+    return text if path.name in text.split(": ")[0] else f"{path.name}: {text}"
+
+
+def _name_key(path: Path) -> list[tuple[int, int, str]]:
+    """Return a sort key by which run_9 comes before run_10."""
+    return [
+        (0, int(piece), "") if piece.isdigit() else (1, 0, piece)
+        for piece in re.split(r"(\d+)", str(path))
+        if piece
+    ]
+
+
+def _find_lost_spans(
+    lost: LostFiles, parts: Mapping[Path, xr.Dataset], options: ReadOptions
+) -> dict[Path, Span]:
+    """Find the time spans [ns since 1970] of lost files, as far as they can be determined.
+
+    A lost file fills the gap between the files whose names come before and after its name, if these
+    follow each other in time; `parts` are the files that were read. Otherwise the stamps that are
+    still readable are used.
+    """
+    spans = {
+        path: log_span(part) if "sampling_rate_hz" in part.attrs else stamp_span(part)
+        for path, part in parts.items()
+        if "time" in part.variables
+    }
+    names = sorted([*spans, *lost], key=_name_key)
+    lost_spans: dict[Path, Span] = {}
+    for path in lost:
+        place = names.index(path)
+        previous_path = next((name for name in reversed(names[:place]) if name in spans), None)
+        next_path = next((name for name in names[place:] if name in spans), None)
+        between = (
+            _span_between(spans, previous_path, next_path) if previous_path and next_path else None
+        )
+        if span := between or _span_of_stamps(path, options):
+            lost_spans[path] = span
+    return lost_spans
+
+
+def _span_between(spans: Mapping[Path, Span], previous_path: Path, next_path: Path) -> Span | None:
+    """Return the time between two consecutive files; None if a third lies between."""
+    (_, end), (start, _) = sorted([spans[previous_path], spans[next_path]])
+    other_spans = [span for path, span in spans.items() if path not in (previous_path, next_path)]
+    free = end < start and not any(first < start and last > end for first, last in other_spans)
+    return (end, start) if free else None
+
+
+def _span_of_stamps(path: Path, options: ReadOptions) -> Span | None:
+    """Return the first and last readable stamp of a damaged file."""
+    with contextlib.suppress(GyrostabError, OSError, RuntimeError, ValueError):
+        summary = scan_file(path, options)
+        if summary.first is not None and summary.last is not None and summary.first < summary.last:
+            return int(to_nanoseconds(summary.first)), int(to_nanoseconds(summary.last))
+    return None
+
+
+def _add_lost_notes(log: xr.Dataset, lost: LostFiles, spans: Mapping[Path, Span]) -> xr.Dataset:
+    """Add notes on the lost files, and their names as ``unreadable_files``."""
+    if not lost:
+        return log
+    notes = []
+    for path, reason in lost.items():
+        where = "where no other file has its time, there is a gap"
+        if path in spans:
+            first, last = map(format_stamp, spans[path])
+            where = (
+                f"its time is between {first} and {last}, which is a gap unless another file "
+                "covers it"
+            )
+        notes.append(f"{reason}; the file is left out: {where}")
+    return log.assign_attrs(
+        notes=[*texts(log, "notes"), *notes],
+        unreadable_files=[*texts(log, "unreadable_files"), *(path.name for path in lost)],
+    )

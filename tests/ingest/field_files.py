@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from gyrostab.ingest.formats.layout import crc32_mpeg2
 from gyrostab.ingest.formats.matlab import keep_pandas_options
-from gyrostab.ingest.formats.messages import crc32_mpeg2
 
 ROWS, RATE = 60, 50.0
 START = np.datetime64("2026-03-01T12:00:00", "ns")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.io import loadmat, savemat
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.formats.matlab5 import read_arrays
+from gyrostab.ingest.formats.matlab import read_arrays
 
 
 @pytest.fixture(scope="module")

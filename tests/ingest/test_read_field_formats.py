@@ -13,7 +13,7 @@ import pytest
 
 from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError
 from gyrostab.ingest import ReadOptions, read_log, scan_file
-from gyrostab.ingest.formats.messages import crc32_mpeg2
+from gyrostab.ingest.formats.layout import crc32_mpeg2
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.ingest.reading import read_channel

@@ -13,7 +13,7 @@ import pytest
 
 from gyrostab.errors import OptionError
 from gyrostab.ingest import read_log, scan_file
-from gyrostab.ingest.columns import preset
+from gyrostab.ingest.columns import plan
 
 RAD = math.degrees(1) * 3600  # deg/h
 IN_RADIANS = (0.001 * RAD, -0.002 * RAD, 0.003 * RAD)
@@ -190,7 +190,7 @@ def key_of(name: str) -> str:
 
 
 def test_each_preset_has_a_sample() -> None:
-    folder = Path(preset.__file__).with_name("presets")
+    folder = Path(plan.__file__).with_name("presets")
     assert {key_of(name) for name in SAMPLES} == {place.stem for place in folder.glob("*.toml")}
 
 

@@ -8,9 +8,17 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
+import numpy as np
+
 from gyrostab.errors import GyrostabError
-from gyrostab.ingest.columns.dates import YEAR_FIRST
-from gyrostab.ingest.columns.stamps import parse_time_unit
+from gyrostab.ingest.columns.dates import DAY_FIRST, NAMED_ZONE, NO_DATE, YEAR_FIRST, find_order
+from gyrostab.ingest.columns.stamps import (
+    NAT,
+    cells_to_ns,
+    from_fortran,
+    is_number,
+    parse_time_unit,
+)
 from gyrostab.schema import RESERVED_NAMES
 from gyrostab.units import known_units, parse_unit
 
@@ -46,6 +54,11 @@ QUANTITIES = {
 KNOWN_CHANNEL_PATTERN = re.compile(
     r"^(temperature|vibration|rotation_rate|supply_voltage|light_power|pressure|ramp|accel_[xyz]|mag_[xyz])$"
 )
+#: Cells without a value, in lower case; other text is unreadable. The kernel knows them too.
+VOID_CELLS = frozenset(("", "nan", "-nan", "null", "na", "n/a", "none"))
+#: Rises for each fall above which a column holds stamps: a clock may step back, and noise rises as
+#: often as it falls.
+RISES_OF_STAMPS = 9
 #: Other names of a temperature, in lower case.
 TEMPERATURE_PATTERN = re.compile(r"temp|(^|[^a-z])tmp")
 
@@ -60,6 +73,34 @@ class FileColumn:
     stamped: bool = False  # holds dates (text, datetime types)
     date_order: str | None = YEAR_FIRST  # of these dates; None if they can be read in two ways
     target: str | None = None  # by a code of the format, in the form of --map, which overrules it
+    cells: Sequence[str] = ()  # the first ones, with decimal points; empty if they are not known
+
+    @property
+    def is_filled(self) -> bool:
+        """Whether any of the first cells is filled, as far as they are known."""
+        return not self.cells or any(cell.strip().lower() not in VOID_CELLS for cell in self.cells)
+
+    @property
+    def first_word(self) -> str:
+        """The first cell that holds no number, cut to 60 characters; empty without one."""
+        cells = (cell.strip()[:60] for cell in self.cells)
+        return next((c for c in cells if c.lower() not in VOID_CELLS and not is_number(c)), "")
+
+    @property
+    def is_rising(self) -> bool:
+        """Whether the first filled cells rise from row to row, as stamps do."""
+        cells = [cell for cell in self.cells if cell.strip()]
+        if all(map(is_number, cells)):
+            steps = np.diff([float(from_fortran(cell)) for cell in cells])
+        else:
+            order = find_order(cells) or DAY_FIRST
+            if order == NAMED_ZONE:
+                return True
+            if order == NO_DATE:
+                cells = [f"1970-01-01 {cell}" for cell in cells]
+            stamps = cells_to_ns(cells, None, 0, order)
+            steps = np.diff(stamps[stamps != NAT])
+        return int((steps > 0).sum()) > RISES_OF_STAMPS * int((steps < 0).sum())
 
 
 @dataclass
@@ -80,6 +121,11 @@ class Header:
     def low(self) -> str:
         """Name in lower case."""
         return self.name.lower()
+
+    @property
+    def may_rise(self) -> bool:
+        """Whether the first cells rise, as far as they are known."""
+        return not self.file.cells or self.file.is_rising
 
 
 def split_header(text: str) -> tuple[str, str | None]:
@@ -175,16 +221,9 @@ def quantity_of(low: str) -> str | None:
     )
 
 
-def unit_quantity(quantity: str) -> str:
-    """Return the quantity in whose units a channel may be given."""
-    return "rate" if quantity == "rotation_rate" else quantity
-
-
 def example_unit(quantity: str | None) -> str:
     """Return a unit to suggest in a message."""
-    if quantity is None:
-        return "1"
-    return "deg/s" if quantity == "rotation_rate" else known_units(quantity).split(",")[0]
+    return "1" if quantity is None else known_units(quantity).split(",")[0]
 
 
 def channel_name(column: Header) -> str:

@@ -1,11 +1,22 @@
-"""The plan of a file: columns to read, notes, problems, and the options that were used."""
+"""The plan of a file: columns to read, notes, problems, and the options that were used.
+
+Presets name the columns in the files of known programs: TOML files, recognised by headers and lines
+above them. A preset has a `name`, `times` (candidates for the time column; the first that is filled
+is used) and `columns`: target in the form of ``--map`` -> headers that the program writes. `above`
+and `file` are patterns for a line above the header and for the file name, `needs` lists further
+headers that must be present, `drops` lists columns that are not kept, and `rate` is a pattern that
+finds the sampling rate [Hz] above the header.
+"""
 
 from __future__ import annotations
 
-import shlex
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 from gyrostab.errors import FormatError, GyrostabError
 from gyrostab.ingest.columns.dates import YEAR_FIRST
@@ -15,19 +26,18 @@ from gyrostab.ingest.columns.headers import (
     Header,
     channel_name,
     distinct_columns,
-    example_unit,
     free_name,
-    is_unit_of,
     split_header,
     stored_name,
 )
 from gyrostab.ingest.columns.stamps import TimeUnit
-from gyrostab.ingest.limits import describe_limit
 from gyrostab.ingest.options import ColumnSummary, ReadOptions
+from gyrostab.store.toml import load_toml_folder
 from gyrostab.wording import list_some
 
 #: Columns that a message lists by name.
 MAX_HEADERS = 30
+_PRESET_KEYS = {"name", "above", "file", "needs", "times", "drops", "rate", "columns"}
 
 
 @dataclass(frozen=True)
@@ -41,7 +51,6 @@ class Column:
     header: str
     role: str  # "time", "gyro" or "channel"
     name: str  # "time", the axis, or the channel
-    quantity: str
     units: str
     factor: float = 1.0
     offset: float = 0.0
@@ -56,23 +65,12 @@ class Plan:
 
     path: Path
     options: ReadOptions  # with the sampling rate that the lines above the header name
-    #: Returns whether the first values of a column rise; None if the format does not look.
-    rising: Callable[[int], bool] | None = None
-    #: Returns the first value of a column that does not hold a number, or nothing.
-    word_in: Callable[[int], str] = lambda source: ""
     columns: list[Column] = field(default_factory=list)
     summaries: list[ColumnSummary] = field(default_factory=list)
     signal: str | None = None  # "rate", "angle" or None
     kind: str | None = None  # "rate", "angle" or "increment"
     notes: list[str] = field(default_factory=list)
     problems: list[GyrostabError] = field(default_factory=list)
-    #: Headers of gyro axes of a file of channels, and of channels beyond the limit.
-    left_out: list[str] = field(default_factory=list)
-    surplus: list[str] = field(default_factory=list)
-    kept_channels: int = 0
-    unitless: list[tuple[str, str | None, str]] = field(
-        default_factory=list
-    )  # name, quantity, header
     used_map: set[str] = field(default_factory=set)
     used_units: set[str] = field(default_factory=set)
 
@@ -96,10 +94,6 @@ class Plan:
         """Options that match no column."""
         unused = [f"--unit {key}" for key in self.options.unit if key not in self.used_units]
         return [f"--map {key}" for key in self.options.map if key not in self.used_map] + unused
-
-    def rises(self, column: Header) -> bool:
-        """Return whether the first values of a column may rise."""
-        return self.rising is None or self.rising(column.source)
 
     def unit_key(self, names: Sequence[str]) -> str | None:
         """Return the key of ``--unit`` that is the first of some names, in any case of letters."""
@@ -144,51 +138,17 @@ class Plan:
 
     def leave_out(self, column: Header) -> None:
         """Add the summary of a column that is left out."""
-        self.add_summary(column, column.name, "left out", None, column.unit or column.stored)
+        self.add_summary(column, column.name, "left out", column.unit or column.stored)
 
     def add_column(self, column: Header, text: str | None, planned: Column) -> None:
         """Add a column to read, with the unit that the file or the user gives it."""
         self.columns.append(planned)
         name = column.low if planned.role == "gyro" else planned.name
-        self.add_summary(column, name, planned.role, planned.quantity, text)
+        self.add_summary(column, name, planned.role, text)
 
-    def add_summary(
-        self, column: Header, name: str, role: str, quantity: str | None, unit: str | None
-    ) -> None:
+    def add_summary(self, column: Header, name: str, role: str, unit: str | None) -> None:
         """Add the summary of a column."""
-        self.summaries.append(ColumnSummary(column.header, name, role, quantity, unit, column.key))
-
-    def add_notes(self, columns: Sequence[FileColumn]) -> None:
-        """Add notes on columns that were left out, and sort the summaries as in the file."""
-        if self.unitless:
-            name, quantity, _ = min(
-                self.unitless, key=lambda entry: entry[1] is None
-            )  # a known quantity first
-            option = f"--unit {shlex.quote(f'{name}={example_unit(quantity)}')}"
-            if quantity is None and is_unit_of(name, ("rate",)):
-                option = f'--map "{name}=rotation_rate [{name}]"'
-            advice = f"keep one with a unit: {option}"
-            self.notes.append(
-                "left out, as they carry no unit: "
-                f"{list_some([header for _, _, header in self.unitless], MAX_HEADERS)} ({advice})"
-            )
-        if self.surplus:
-            needed = self.kept_channels + len(self.surplus)
-            advice = (
-                "map those that are needed (--map NAME=NAME); "
-                f"{describe_limit('channels', needed, self.options.limits)}"
-            )
-            self.notes.append(
-                "left out, as there are more channels than a log keeps: "
-                f"{list_some(self.surplus, 5)} ({advice})"
-            )
-        if self.left_out:
-            self.notes.append(
-                "left out, as the file is read for its channels: "
-                f"{list_some(self.left_out, MAX_HEADERS)}"
-            )
-        place = {column.header.strip(): index for index, column in enumerate(columns)}
-        self.summaries.sort(key=lambda summary: place.get(summary.header, -1))
+        self.summaries.append(ColumnSummary(column.header, name, role, unit, column.key))
 
 
 def name_columns(
@@ -264,3 +224,58 @@ def _is_taken(target: str, asked: set[str]) -> bool:
     return target in asked or (
         bool(AXIS_PATTERN.match(target)) and any(AXIS_PATTERN.match(name) for name in asked)
     )
+
+
+class PresetMatch(NamedTuple):
+    """A preset that fits a file: column number -> target of ``--map``; rate [Hz] if known."""
+
+    name: str = ""
+    columns: Mapping[int, str] = MappingProxyType({})
+    rate: float | None = None
+
+
+@cache
+def _load_presets() -> dict[str, dict[str, Any]]:
+    """Load the presets, by file name."""
+    presets = load_toml_folder("gyrostab.ingest.columns", "presets")
+    for name, preset in presets.items():
+        assert set(preset) <= _PRESET_KEYS, f"{name}: {set(preset) - _PRESET_KEYS}"
+    return presets
+
+
+def find_preset(
+    path: Path,
+    columns: Sequence[FileColumn],
+    above: Sequence[str],
+) -> PresetMatch:
+    """Find the preset that fits a file, with an empty name for the files of other programs.
+
+    `above` are the lines above the header.
+    """
+    places: dict[str, int] = {}
+    for place, column in reversed(list(enumerate(columns))):
+        for name in (split_header(column.header)[0], column.header):
+            places[name.strip().lower()] = place
+
+    def held(names: Sequence[str]) -> list[int]:
+        return [places[name.lower()] for name in names if name.lower() in places]
+
+    for key, preset in _load_presets().items():
+        gyro = [names for target, names in preset["columns"].items() if target.startswith("gyro_")]
+        if (
+            not all(map(held, [*gyro, *([name] for name in preset.get("needs", ()))]))
+            or ("file" in preset and not re.search(preset["file"], path.name, re.IGNORECASE))
+            or ("above" in preset and not any(re.search(preset["above"], line) for line in above))
+        ):
+            continue
+        targets = dict.fromkeys(held(preset.get("drops", ())), "-")
+        times = {at: time["unit"] for time in preset["times"] for at in held([time["column"]])}
+        targets |= dict.fromkeys(times, "-")
+        filled_times = [at for at in times if columns[at].is_filled]
+        targets |= {at: f"time [{times[at]}]" for at in filled_times[:1]}
+        for target, names in preset["columns"].items():
+            targets |= dict.fromkeys(held(names)[:1], target)
+        matches = (re.search(preset["rate"], line) for line in above if "rate" in preset)
+        rates = [float(match[1]) for match in matches if match]
+        return PresetMatch(f"{preset['name']} (preset {key})", targets, next(iter(rates), None))
+    return PresetMatch()

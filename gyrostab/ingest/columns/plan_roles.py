@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -27,20 +27,20 @@ from gyrostab.ingest.columns.headers import (
     quantity_of,
     split_header,
     stored_name,
-    unit_quantity,
 )
 from gyrostab.ingest.columns.plan import (
     MAX_HEADERS,
     Column,
     Plan,
+    PresetMatch,
+    find_preset,
     name_columns,
     resolve_duplicates,
 )
 from gyrostab.ingest.columns.plan_time import find_time
-from gyrostab.ingest.columns.preset import PresetMatch, find_preset
-from gyrostab.ingest.limits import check_columns, limit_value
+from gyrostab.ingest.limits import check_columns, describe_limit, limit_value
 from gyrostab.ingest.options import ReadOptions
-from gyrostab.units import HOUR, INNER, known_units, parse_unit
+from gyrostab.units import INNER, known_units, parse_unit
 from gyrostab.wording import list_some
 
 
@@ -49,25 +49,18 @@ def plan_columns(
     columns: Sequence[FileColumn],
     options: ReadOptions,
     *,
-    rising: Callable[[int], bool] | None = None,
     above: Sequence[str] = (),
-    is_filled: Callable[[int], bool] = lambda source: True,
-    word_in: Callable[[int], str] = lambda source: "",
 ) -> Plan:
     """Determine the role and unit of each column.
 
-    `rising` returns whether the first values of a column rise, which decides between candidates for
-    the time column; `above` are the lines above the header, which may identify the program that
-    wrote the file; `is_filled` returns whether any of the first cells of a column is filled, and
-    `word_in` the first of them that holds no number, or nothing.
+    `above` are the lines above the header, which may identify the program that wrote the file.
     """
     check_columns(path, len(columns), options.limits)
     headers = [column.header for column in columns]
-    split = [(header, split_header(header)[0]) for header in headers]
-    preset = PresetMatch()
-    if not any(AXIS_PATTERN.match(name.lower()) for _, name in split):  # named gyro_x ... already
-        preset = find_preset(path, split, above=above, is_filled=is_filled)
-    plan = Plan(path, options, rising, word_in)
+    names = (split_header(header)[0].lower() for header in headers)
+    has_axes = any(map(AXIS_PATTERN.match, names))  # named gyro_x ... already
+    preset = PresetMatch() if has_axes else find_preset(path, columns, above)
+    plan = Plan(path, options)
     named = resolve_duplicates(plan, name_columns(plan, columns, preset.columns))
     time = find_time(plan, named)
     data_columns = [column for column in named if column is not time]
@@ -94,7 +87,8 @@ def plan_columns(
             "there is no time column; give the sampling rate with --rate HZ (and --start), or "
             f"name the column: --map NAME=time. Columns: {list_some(headers, MAX_HEADERS)}",
         )
-    plan.add_notes(columns)
+    place = {header.strip(): index for index, header in enumerate(headers)}
+    plan.summaries.sort(key=lambda summary: place.get(summary.header, -1))
     order = {"time": 0, "gyro": 1, "channel": 2}
     plan.columns.sort(
         key=lambda column: (order[column.role], column.name if column.role == "gyro" else "")
@@ -107,7 +101,7 @@ def _plan_gyro(plan: Plan, gyro: list[Header], columns: Sequence[FileColumn]) ->
     if plan.options.channels_only:
         for column in gyro:
             plan.leave_out(column)
-        plan.left_out.extend(c.header for c in gyro)
+        _note_left_out(plan, "the file is read for its channels", [c.header for c in gyro])
         return
     if not gyro:
         if not plan.problems:
@@ -139,9 +133,9 @@ def _plan_axis(plan: Plan, column: Header) -> str | None:
     keys = [column.low, column.key, column.header, stem, "gyro"]  # "gyro" is any gyro axis
     text = plan.find_unit(column, keys, column.unit, lambda written: is_unit_of(written, allowed))
 
-    def refuse(error: type[UnitError], problem: str, quantity: str | None = None) -> None:
+    def refuse(error: type[UnitError], problem: str) -> None:
         plan.refuse(error, problem)
-        plan.add_summary(column, column.low, "gyro", quantity, text)
+        plan.add_summary(column, column.low, "gyro", text)
 
     if text is None:
         refuse(
@@ -171,10 +165,9 @@ def _plan_axis(plan: Plan, column: Header) -> str | None:
             f"not of {allowed[0]}; {allowed[0]} units are {known_units(allowed[0])}; give the "
             f"right one with --unit {stem}={example}, or with a factor for counts: --unit "
             f'"{stem}=0.1 {"arcsec/s" if stem == "gyro" else "arcsec"}"',
-            unit.quantity,
         )
         return None
-    planned = column.source, column.header, "gyro", axis, unit.quantity, INNER[unit.quantity]
+    planned = column.source, column.header, "gyro", axis, INNER[unit.quantity]
     plan.add_column(column, text, Column(*planned, unit.factor, unit.offset))
     return unit.quantity
 
@@ -207,19 +200,17 @@ def _find_kind(plan: Plan, header: str, key: str, name: str) -> str:
 def _plan_channels(plan: Plan, rest: list[Header]) -> None:
     """Plan the channels: those with a unit are kept, others left out with a note or refused."""
     _note_temperatures(plan, rest)
+    limits, others = plan.options.limits, len(plan.columns)  # time and gyro
+    unitless: list[tuple[str, str | None]] = []  # name and quantity of channels without a unit
+    left_out: dict[str, list[str]] = {"unit": [], "limit": []}
     for column in rest:
         quantity = quantity_of(column.low)
         likely = quantity or ("temperature" if TEMPERATURE_PATTERN.search(column.low) else None)
         is_known = bool(KNOWN_CHANNEL_PATTERN.match(column.low))
         name = channel_name(column)
-        keys = [
-            name,
-            column.name,
-            column.key,
-            column.header,
-            *([column.low.split("_")[0]] if quantity else []),
-        ]
-        usable = partial(is_unit_of, quantities=(unit_quantity(quantity),)) if quantity else is_unit
+        keys = [name, column.name, column.key, column.header]
+        keys += [column.low.split("_")[0]] if quantity else []
+        usable = partial(is_unit_of, quantities=(quantity,)) if quantity else is_unit
         text = plan.find_unit(column, keys, column.unit, usable)
         if column.low == "ramp" and text is None:
             text = "1"  # any scale will do
@@ -234,19 +225,35 @@ def _plan_channels(plan: Plan, rest: list[Header]) -> None:
                 f"column {column.header!r} carries no unit; give it with --unit "
                 f'{name}={example_unit(likely)}, or drop the column with --map "{column.key}=-"',
             )
-        if (
-            text is not None
-            and not (is_known or asked)
-            and plan.kept_channels >= limit_value("channels", plan.options.limits)
-        ):
-            plan.surplus.append(column.header)
-            plan.leave_out(column)
-            continue
+        is_full = len(plan.columns) - others >= limit_value("channels", limits)
         if text is None:
-            plan.unitless.append((name, likely, column.header))
+            unitless.append((name, likely))
+            left_out["unit"].append(column.header)
             plan.leave_out(column)
-            continue
-        _plan_channel(plan, column, name, quantity, text, is_known=is_known, asked=asked)
+        elif is_full and not (is_known or asked):
+            left_out["limit"].append(column.header)
+            plan.leave_out(column)
+        else:
+            _plan_channel(plan, column, name, quantity, text, is_known=is_known, asked=asked)
+    if unitless:
+        name, likely = min(unitless, key=lambda entry: entry[1] is None)  # a known quantity first
+        option = f"--unit {shlex.quote(f'{name}={example_unit(likely)}')}"
+        if likely is None and is_unit_of(name, ("rate",)):
+            option = f'--map "{name}=rotation_rate [{name}]"'
+        advice = f"keep one with a unit: {option}"
+        _note_left_out(plan, "they carry no unit", left_out["unit"], advice)
+    needed = len(plan.columns) - others + len(left_out["limit"])
+    advice = "map those that are needed (--map NAME=NAME); "
+    advice += describe_limit("channels", needed, limits)
+    reason = "there are more channels than a log keeps"
+    _note_left_out(plan, reason, left_out["limit"], advice)
+
+
+def _note_left_out(plan: Plan, reason: str, headers: list[str], advice: str = "") -> None:
+    """Add a note on columns that were left out, if there are any."""
+    if headers:
+        listed = list_some(headers, MAX_HEADERS)
+        plan.notes.append(f"left out, as {reason}: {listed}{f' ({advice})' if advice else ''}")
 
 
 def _note_temperatures(plan: Plan, rest: list[Header]) -> None:
@@ -281,17 +288,15 @@ def _plan_channel(
 ) -> None:
     factor, offset, units = 1.0, 0.0, text
     if quantity is not None:
-        expected = unit_quantity(quantity)
-        if is_unit_of(text, (expected,)):
-            unit = parse_unit(text, expected)
-            scale = 1.0 / HOUR if quantity == "rotation_rate" else 1.0
-            factor, offset, units = unit.factor * scale, unit.offset, INNER[quantity]
+        if is_unit_of(text, (quantity,)):
+            unit = parse_unit(text, quantity)
+            factor, offset, units = unit.factor, unit.offset, INNER[quantity]
         elif quantity == "number" and is_known:
             units = INNER["number"]
         elif is_known:
-            message = f"column {column.header!r}: {text!r} is not a known unit of {expected}"
+            message = f"column {column.header!r}: {text!r} is not a known unit of {quantity}"
             advice = (
-                f"known are {known_units(expected)}; give it with --unit "
+                f"known are {known_units(quantity)}; give it with --unit "
                 f"{name}={example_unit(quantity)}"
             )
             if not asked:
@@ -300,16 +305,13 @@ def _plan_channel(
                 return
             fix = f'{advice}, or drop the column with --map "{column.key}=-"'
             plan.refuse(UnitError, f"{message}; {fix}")
-        else:
-            quantity = None
     stored = stored_name(name)
     if stored != name:
         plan.notes.append(
             f"column {column.header!r} is kept as {stored!r}, as {name!r} is a variable of "
             f'gyrostab; for another name give --map "{column.key}=NAME"'
         )
-    plan.kept_channels += 1
-    planned = column.source, column.header, "channel", stored, quantity or "other", units
+    planned = column.source, column.header, "channel", stored, units
     plan.add_column(column, text, Column(*planned, factor, offset))
 
 

@@ -44,13 +44,13 @@ def find_time(plan: Plan, named: list[Header]) -> Header | None:
             c
             for c in named
             if c.file.stamped
-            and plan.rises(c)
+            and c.may_rise
             and not (c.mapped or c.preset)
             and not (c.file.date_order in UNREADABLE and plan.options.rate is not None)
         ]
         reason = "it holds dates"
         if not time_columns:
-            clocks = [c for c in named if _is_clock(plan, c)]
+            clocks = [c for c in named if _is_clock(c)]
             time_columns = clocks if len(clocks) == 1 else []
             reason = "it is the only column that rises in a unit of time"
         if time_columns:
@@ -58,7 +58,7 @@ def find_time(plan: Plan, named: list[Header]) -> Header | None:
             plan.notes.append(f"{header!r} is taken for the time column, as {reason}")
     if not time_columns:
         return None
-    column, *rivals = sorted(time_columns, key=lambda c: not plan.rises(c))
+    column, *rivals = sorted(time_columns, key=lambda c: not c.may_rise)
     rivals += [c for c in named if c.low == "time" and c not in time_columns]
     if rivals:
         names = " and ".join(repr(c.header) for c in [column, *rivals][:3])
@@ -71,14 +71,14 @@ def find_time(plan: Plan, named: list[Header]) -> Header | None:
         named[:] = [c for c in named if c not in rivals]
     unit = None if column.file.stamped else _time_unit(plan, column)
     order = _date_order(plan, column) if column.file.stamped else YEAR_FIRST
-    planned = column.source, column.header, "time", "time", "time", "ns"
+    planned = column.source, column.header, "time", "time", "ns"
     plan.columns.append(
         Column(*planned, time_unit=unit, date_order=order, epoch=plan.options.epoch_ns)
     )
     written = unit.text if unit else None
     if column.file.stamped:
         written = "ISO 8601" if order == YEAR_FIRST else order
-    plan.add_summary(column, "time", "time", "time", written)
+    plan.add_summary(column, "time", "time", written)
     if (
         unit is not None
         and unit.epoch is None
@@ -101,7 +101,7 @@ def _may_be_time(column: Header) -> bool:
     return written is None or column.file.stamped or names_epoch(written) or is_time_unit(written)
 
 
-def _is_clock(plan: Plan, column: Header) -> bool:
+def _is_clock(column: Header) -> bool:
     """Return whether a column of another name has a unit of time, and values known to rise."""
     unit = column.unit or column.stored
     return (
@@ -109,8 +109,8 @@ def _is_clock(plan: Plan, column: Header) -> bool:
         and (is_time_unit(unit) or names_epoch(unit))
         and not (column.mapped or column.preset)
         and not KNOWN_CHANNEL_PATTERN.match(column.low)
-        and plan.rising is not None
-        and plan.rises(column)
+        and bool(column.file.cells)
+        and column.file.is_rising
     )
 
 
@@ -119,7 +119,7 @@ def _date_order(plan: Plan, column: Header) -> str:
     if column.file.date_order == NAMED_ZONE:
         plan.refuse(
             UnitError,
-            f"the time column {column.header!r} holds {plan.word_in(column.source)!r}, with the "
+            f"the time column {column.header!r} holds {column.file.first_word!r}, with the "
             "name of a time zone; write the offset from UTC in its place, for instance "
             "2026-05-01T08:00:00-06:00 or 05/20/2026 8:00:00 AM -06:00",
         )
@@ -155,7 +155,7 @@ def _time_unit(plan: Plan, column: Header) -> TimeUnit | None:
     keys = [column.name, column.key, column.header, "time"]
     text = plan.find_unit(column, keys, written, is_time_unit, prefer_given=column.unit is None)
     if text is None:
-        word = plan.word_in(column.source)
+        word = column.file.first_word
         plan.refuse(
             MissingUnitError,
             f"the time column {column.header!r} holds {word!r}, which is neither a number nor a "

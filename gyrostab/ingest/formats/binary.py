@@ -23,9 +23,10 @@ from gyrostab.ingest.formats.layout import (
     Layout,
     find_layout,
     find_layout_file,
+    find_messages,
     layout_path,
+    unwrap_counter,
 )
-from gyrostab.ingest.formats.messages import find_messages, unwrap_counter
 from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, make_reader
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.time.grid import check_span, grid_times

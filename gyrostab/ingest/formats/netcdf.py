@@ -7,20 +7,25 @@ from the coordinate of the short dimension, or ``name/0`` without such a coordin
 
 from __future__ import annotations
 
+import io
+import math
+import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
-from gyrostab.errors import FormatError
+from gyrostab.errors import FormatError, SchemaError, TimeError
 from gyrostab.ingest.columns.headers import AXIS_PATTERN, split_header
 from gyrostab.ingest.columns.stamps import names_epoch
-from gyrostab.ingest.combine import with_channels
-from gyrostab.ingest.formats.netcdf_logs import open_log, summarise_log
-from gyrostab.ingest.formats.netcdf_variables import find_variables, open_undecoded
+from gyrostab.ingest.combine import attach_channels
+from gyrostab.ingest.concat.grid import log_span
 from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.formats.tables import (
     StoredArray,
@@ -29,12 +34,23 @@ from gyrostab.ingest.formats.tables import (
     read_tables,
     scan_tables,
 )
-from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.schema import texts
+from gyrostab.ingest.limits import check_chunk, check_declared
+from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
+from gyrostab.ingest.uniform import as_uniform
+from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name, texts
+from gyrostab.store.attributes import read_attribute
+from gyrostab.store.cf import from_disk
+from gyrostab.store.damage import check_blosc_chunks, check_global_heaps
+from gyrostab.store.read import open_stored
+from gyrostab.store.remote import find_url
+from gyrostab.store.times import decode_stamps
 
 MAX_COLUMNS = 64
 #: Names of variables whose columns are gyro axes.
 _SIGNALS = ("gyro", "rate")
+_CALENDARS = ("standard", "gregorian", "proleptic_gregorian")
+_VALID_RANGES = {"valid_range", "valid_min", "valid_max"}
+_OTHER_CONTENT = {"surface": "a dynamic Allan variance", "product": "a product"}
 
 _is_netcdf = make_matcher(b"CDF", ".nc", ".nc4", ".cdf", ".netcdf")
 
@@ -48,11 +64,11 @@ def matches(path: Path) -> bool:
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Summarise variables, sizes, and first and last stamps."""
-    log = open_log(path, options)
+    log = _open_log(path, options)
     if log is not None:
         with log:
-            return summarise_log(path, log)
-    with open_undecoded(path) as stored:
+            return _summarise_log(path, log)
+    with _open_undecoded(path) as stored:
         form = "zarr" if path.is_dir() else "netcdf"
         main, slower, notes = _find_tables(path, stored, options)
         summary = scan_tables(path, form, [main], options, notes)
@@ -63,10 +79,10 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
 
 def read(path: Path, options: ReadOptions) -> xr.Dataset:
     """Open a regular log lazily, or read the raw log of a foreign file; see `read_log`."""
-    log = open_log(path, options)
+    log = _open_log(path, options)
     if log is not None:
         return log
-    with open_undecoded(path) as stored:
+    with _open_undecoded(path) as stored:
         main, slower, notes = _find_tables(path, stored, options)
         log = read_tables(path, [main], options, notes=notes)
         for table in slower:
@@ -85,7 +101,7 @@ def _find_tables(
 
     The main dimension is the longest of those with gyro axes, otherwise the longest.
     """
-    variables, sizes = find_variables(path, stored, options.limits), stored.sizes
+    variables, sizes = _find_variables(path, stored, options.limits), stored.sizes
     numeric = {n: v for n, v in variables.items() if v.dtype.kind in "iuf" and v.ndim in (1, 2)}
     lines = Counter(max(v.dims, key=lambda d: sizes[d]) for v in numeric.values())
     if not lines:
@@ -132,7 +148,7 @@ def _add_channels(log: xr.Dataset, part: xr.Dataset) -> xr.Dataset:
     }
     unmatched = set(texts(log, "unmatched_options")) & set(texts(part, "unmatched_options"))
     log = log.assign_attrs(lists, unmatched_options=sorted(unmatched))
-    return with_channels(log, [part]) if part.data_vars else log
+    return attach_channels(log, [part]) if part.data_vars else log
 
 
 def _holds_axes(name: str, variable: xr.Variable, options: ReadOptions) -> bool:
@@ -164,3 +180,198 @@ def _columns_of(variables: Mapping[str, xr.Variable], name: str, dim: Any) -> li
     stem = "gyro_" if name.lower() in _SIGNALS else f"{name}/"
     names = [f"{stem}{label}" for label in labels]
     return StoredArray(variable, along).make_columns(names, variable.attrs)
+
+
+@contextmanager
+def _open_undecoded(path: Path) -> Iterator[xr.Dataset]:
+    """Open a file or store with xarray, which decodes neither numbers nor stamps."""
+    options: dict[str, Any] = {"engine": "netcdf4"}
+    if path.is_dir():
+        options = {"engine": "zarr", "consolidated": False}
+    try:
+        stored = xr.open_dataset(
+            path, chunks=None, decode_cf=False, create_default_indexes=False, **options
+        )
+    except KeyError as error:
+        if "dimension" not in str(error):
+            raise
+        raise FormatError(
+            f"{path.name}: an array does not name its dimensions; give it the attribute "
+            "_ARRAY_DIMENSIONS (Zarr format 2) or dimension_names (format 3)"
+        ) from error
+    with stored:
+        yield stored
+
+
+def _find_variables(
+    path: Path, stored: xr.Dataset, limits: Mapping[str, float]
+) -> dict[str, xr.Variable]:
+    """Return the variables, with the fill value of the format if they have none.
+
+    `FormatError` if a chunk is too large. In Zarr format 2 the fill value of an array marks missing
+    values, except for 0, which is its default.
+    """
+    variables = {str(name): variable for name, variable in stored.variables.items()}
+    for name, variable in variables.items():
+        chunks = variable.encoding.get("chunks" if path.is_dir() else "chunksizes") or ()
+        check_chunk(path, name, variable.dtype.itemsize * math.prod(map(int, chunks)), limits)
+        if not path.is_dir():
+            variable.attrs = _with_default_fill(variable.attrs, variable.dtype)
+        elif not (path / "zarr.json").exists() and not np.all(variable.attrs.get("_FillValue", 1)):
+            del variable.attrs["_FillValue"]
+    return dict(sorted(variables.items())) if path.is_dir() else variables
+
+
+def _with_default_fill(attributes: dict[Any, Any], dtype: Any) -> dict[Any, Any]:
+    """Add the default fill value of the NetCDF library; bytes have none (users guide)."""
+    import netCDF4
+
+    if (
+        {"_FillValue", "_Unsigned"} & set(attributes)
+        or dtype.kind not in "iuf"
+        or dtype.itemsize == 1
+    ):
+        return attributes
+    return {**attributes, "_FillValue": dtype.type(netCDF4.default_fillvals[dtype.str[1:]])}
+
+
+def _open_log(path: Path, options: ReadOptions) -> xr.Dataset | None:
+    """Open a regular log, of gyrostab or with a stamp for each sample; None for other files."""
+    if url := find_url(path):
+        return _open_remote(path, url)
+    if path.is_file():
+        _check_classic_header(path)
+    content = read_attribute(path, "gyrostab_content")
+    if content != "log":
+        if path.is_file():
+            check_global_heaps(path)
+        if content in _OTHER_CONTENT and not options.channels_only:
+            raise FormatError(
+                f"{path.name}: is {_OTHER_CONTENT[content]} that gyrostab wrote, not a log; give "
+                "the log that it was made from"
+            )
+        if path.is_dir():
+            check_blosc_chunks(path)
+        if not _is_regular(path):
+            return None
+    check = partial(check_declared, given=options.limits)
+    stored = open_stored(path, strict=options.strict, check=check)
+    if path.is_dir() and content != "log":
+        stored = stored[sorted(stored.variables, key=str)]  # as the order in a folder is arbitrary
+    try:
+        return _open_regular(path, stored)
+    except TimeError:
+        if content == "log":
+            raise
+        return None  # its rows are placed by their stamps, like those of other files
+
+
+def _open_regular(path: Path, stored: xr.Dataset) -> xr.Dataset:
+    try:
+        log = as_uniform(from_disk(stored, path.name))
+    except (SchemaError, TimeError) as error:
+        stored.close()
+        raise type(error)(f"{path.name}: {error}") from error
+    log.attrs.setdefault("source_files", [path.name])
+    return log
+
+
+def _open_remote(path: Path, url: str) -> xr.Dataset:
+    """Open a Zarr log of gyrostab at an address."""
+    stored = open_stored(path)
+    content = str(stored.attrs.get("gyrostab_content", ""))
+    if content != "log":
+        raise FormatError(
+            f"{url}: is {_OTHER_CONTENT.get(content, 'a Zarr store of another program')}"
+            ", not a log of gyrostab; open it with xarray and give it to gyrostab.davar, or copy "
+            "it here and use gyrostab ingest"
+        )
+    return _open_regular(path, stored)
+
+
+def _is_regular(path: Path) -> bool:
+    """Return whether a file has signal, axes, stamps and sampling rate, as a regular log has.
+
+    The signal of a NetCDF file needs a fill value: without one, samples that were not written have
+    that of the library, which xarray does not take for missing.
+    """
+    with _open_undecoded(path) as stored:
+        stamps = stored.variables.get("time")
+        signals = [stored.variables[name] for name in SIGNAL_UNITS if name in stored.variables]
+        return (
+            "sampling_rate_hz" in stored.attrs
+            and "axis" in stored.variables
+            and any(path.is_dir() or "_FillValue" in signal.attrs for signal in signals)
+            and stamps is not None
+            and _is_dated(stamps)
+            and all(_decodes_as_cf(variable.attrs) for variable in stored.variables.values())
+        )
+
+
+class _BoundedFile(io.BufferedReader):
+    """A file that allocates no more bytes than it holds, whatever is asked for."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return super().read(min(size or 0, os.fstat(self.fileno()).st_size))
+
+
+def _check_classic_header(path: Path) -> None:
+    """Refuse a file of CDF-1 or CDF-2 whose header asks for more than the file holds.
+
+    The NetCDF library would allocate whatever a damaged header asks for; scipy maps the file.
+    """
+    with path.open("rb") as file:
+        if file.read(4) not in (b"CDF\1", b"CDF\2"):
+            return
+    from scipy.io import netcdf_file
+
+    class Header(netcdf_file):
+        def _read_gatt_array(self) -> None:
+            self._read_att_array()  # type: ignore[attr-defined]  # they would replace members of the same names
+
+    try:
+        Header(_BoundedFile(path.open("rb", buffering=0)), mmap=True).close()
+    except Exception as error:  # scipy raises errors of many kinds on damaged headers
+        raise FormatError(
+            f"{path.name}: the header of this NetCDF file is damaged or cut off ({error}); copy "
+            "it again"
+        ) from error
+
+
+def _decodes_as_cf(attributes: dict[Any, Any]) -> bool:
+    """Return whether xarray decodes numbers by the CF conventions; 0 is the default of Zarr."""
+    is_default_fill = not np.all(attributes.get("_FillValue", 1))
+    return not is_default_fill and not _VALID_RANGES & set(attributes)
+
+
+def _is_dated(stamps: xr.Variable) -> bool:
+    """Return whether xarray reads stamps as dates of a recording."""
+    if stamps.attrs.get("calendar", "standard") not in _CALENDARS:
+        return False
+    try:
+        return bool(decode_stamps(stamps[:1]).dtype.kind == "M")
+    except Exception:  # whatever it raises on other units and calendars
+        return False
+
+
+def _summarise_log(path: Path, log: xr.Dataset) -> FileSummary:
+    """Summarise a regular log."""
+    signal, axes = signal_name(log), [str(axis) for axis in log["axis"].values]
+    columns = [ColumnSummary(axis, f"gyro_{axis}", "gyro", SIGNAL_UNITS[signal]) for axis in axes]
+    channels = log_channels(log)
+    columns += [
+        ColumnSummary(name, name, "channel", str(log[name].attrs.get("units", "")))
+        for name in channels
+    ]
+    first, last = (np.datetime64(int(stamp), "ns") for stamp in log_span(log))
+    return FileSummary(
+        path=path,
+        format="gyrostab log",
+        columns=tuple(columns),
+        axes=tuple(axes),
+        channels=tuple(channels),
+        first=first,
+        last=last,
+        n_rows=log.sizes["time"],
+        notes=tuple(log.attrs.get("notes", ())),
+    )

@@ -27,7 +27,7 @@ from gyrostab.ingest.columns.plan import MAX_HEADERS, Column, Plan
 from gyrostab.ingest.columns.plan_roles import plan_columns
 from gyrostab.ingest.columns.stamps import NAT, parse_time_unit
 from gyrostab.ingest.columns.typed import float32_note, read_columns, summarise_columns
-from gyrostab.ingest.combine import concatenate, with_channels
+from gyrostab.ingest.combine import attach_channels, concatenate
 from gyrostab.ingest.formats.packing import Decoder, attribute_text, fold_packing
 from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
@@ -313,7 +313,7 @@ def read_tables(
         elif plan.of("channel"):
             plan = replace(plan, signal=None, kind=None, notes=[])
             channel_logs.append(planned.read(place, plan))
-    log = with_channels(concatenate(main) if len(main) > 1 else main[0], channel_logs)
+    log = attach_channels(concatenate(main) if len(main) > 1 else main[0], channel_logs)
     if "axis_rows" in log.attrs:
         return log
     return log.assign_attrs(source_files=[path.name], row_start=[0])

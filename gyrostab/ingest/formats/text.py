@@ -21,9 +21,6 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.dates import (
-    DAY_FIRST,
-    NAMED_ZONE,
-    NO_DATE,
     find_order,
     has_offset,
     holds_date,
@@ -34,17 +31,10 @@ from gyrostab.ingest.columns.headers import FileColumn
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.plan_roles import plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
-from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, from_fortran
+from gyrostab.ingest.columns.stamps import cells_to_ns, is_number
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.ingest.text.cells import BlockParser, ParsedBlock
-from gyrostab.ingest.text.layout import (
-    VOID_CELLS,
-    Layout,
-    find_layout,
-    is_number,
-    is_text,
-    unit_of_duration,
-)
+from gyrostab.ingest.text.layout import Layout, find_layout, is_text, unit_of_duration
 from gyrostab.store.threads import map_in_order
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
@@ -53,9 +43,6 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
 HEAD_BYTES, MAX_HEAD_BYTES, HEAD_LINES = 2**18, 2**24, 4
 BLOCK_BYTES = 2**22
 COUNTED_BYTES = 2**24
-#: Rises for each fall above which a column holds stamps: a clock may step back, and noise rises as
-#: often as it falls.
-RISES_OF_STAMPS = 9
 
 
 def matches(path: Path) -> bool:
@@ -118,59 +105,23 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
             head += file.read(size)
             size *= 2
         layout = find_layout(path, head, complete=len(head) < size, limits=options.limits)
-    rows = layout.full_samples
     columns = []
     for place, header in enumerate(layout.headers):
-        cells = [row[place] for row in rows]
-        column = FileColumn(header, layout.units.get(place) or _duration_unit(cells))
+        cells = [row[place] for row in layout.full_samples]
+        if layout.decimal_comma:
+            cells = [c.replace(",", ".") if is_number(c, comma=True) else c for c in cells]
+        unit = layout.units.get(place) or _duration_unit(cells)
+        column = FileColumn(header, unit, cells=cells)
         if any(holds_date(cell) or is_time_of_day(cell) or names_zone(cell) for cell in cells):
             column = replace(column, stamped=True, date_order=find_order(cells))
         columns.append(column)
-    plan = plan_columns(
-        path,
-        columns,
-        options,
-        rising=partial(_is_rising, layout),
-        above=layout.above,
-        is_filled=lambda column: any(row[column].strip().lower() not in VOID_CELLS for row in rows),
-        word_in=partial(_find_word, layout),
-    )
-    return layout, plan
-
-
-def _find_word(layout: Layout, column: int) -> str:
-    """Return the first cell of a column that holds no number, cut to 60; empty without one."""
-    cells = (row[column].strip()[:60] for row in layout.full_samples)
-    return next(
-        (
-            cell
-            for cell in cells
-            if cell.lower() not in VOID_CELLS and not is_number(cell, comma=layout.decimal_comma)
-        ),
-        "",
-    )
+    return layout, plan_columns(path, columns, options, above=layout.above)
 
 
 def _duration_unit(cells: Sequence[str]) -> str | None:
     """Return the unit that all cells of a column contain, such as ``0.01 sec``."""
     unit = unit_of_duration(cells[0]) if cells else None
     return unit if unit and all(unit_of_duration(cell) == unit for cell in cells) else None
-
-
-def _is_rising(layout: Layout, column: int) -> bool:
-    """Return whether the first filled cells of a column rise from row to row, as stamps do."""
-    cells = [row[column] for row in layout.full_samples if row[column].strip()]
-    if all(is_number(cell, comma=layout.decimal_comma) for cell in cells):
-        steps = np.diff([float(from_fortran(cell.replace(",", "."))) for cell in cells])
-    else:
-        order = find_order(cells) or DAY_FIRST
-        if order == NAMED_ZONE:
-            return True
-        if order == NO_DATE:
-            cells = [f"1970-01-01 {cell}" for cell in cells]
-        stamps = cells_to_ns(cells, None, 0, order)
-        steps = np.diff(stamps[stamps != NAT])
-    return int((steps > 0).sum()) > RISES_OF_STAMPS * int((steps < 0).sum())
 
 
 def _sample_stamps(

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.ingest.columns.dates import DAY_FIRST, YEAR_FIRST
+from gyrostab.ingest.columns.headers import VOID_CELLS
 from gyrostab.ingest.columns.plan import Plan
 from gyrostab.ingest.columns.stamps import cells_to_ns, from_fortran, integers_to_ns
-from gyrostab.ingest.text.layout import BLANK, VOID_CELLS, Layout
+from gyrostab.ingest.text.layout import BLANK, Layout
 
 
 class ParsedBlock(NamedTuple):

@@ -12,7 +12,8 @@ from pathlib import Path
 
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.dates import holds_date, is_time_of_day, parse_order
-from gyrostab.ingest.columns.headers import is_unit, split_header
+from gyrostab.ingest.columns.headers import VOID_CELLS, is_unit, split_header
+from gyrostab.ingest.columns.stamps import is_number
 from gyrostab.ingest.limits import check_columns
 from gyrostab.wording import list_some
 
@@ -20,8 +21,6 @@ from gyrostab.wording import list_some
 BLANK = " "
 #: Separators of files that may have decimal commas.
 COMMA_SEPARATORS = (";", "\t")
-#: Cells without a value, in lower case; other text is unreadable. The kernel knows them too.
-VOID_CELLS = frozenset(("", "nan", "-nan", "null", "na", "n/a", "none"))
 HEAD_LINES = 200
 #: Lines that are read: those that may be the header, those that follow it, and the first data rows.
 MAX_LINES = 2 * HEAD_LINES + 20
@@ -29,7 +28,6 @@ MAX_LINES = 2 * HEAD_LINES + 20
 #: with another word than the row before: random words of two kinds have half.
 _MIN_RECURRENCES, _MIN_CHANGING_SHARE = 4, 0.75
 
-_NUMBER = re.compile(r"^[+-]?(\d+(\.\d*)?|\.\d+)([eEdD][+-]?\d+)?$")
 _HEADER_CELLS = re.compile(r"(?:[^\s\[]+(?:\[[^\[\]]*\])?(?:[ \t]+\[[^\[\]]*\])?)")
 _DURATION = re.compile(r"^\s*[+-]?\d+(?:\.\d+)? (ms|s|sec|min|h|hr|d|day|days)\s*$")
 _COMMENT = re.compile(r"^\s*[#%]")
@@ -72,12 +70,6 @@ class Layout:
     def split_row(self, line: str) -> list[str]:
         """Split a data row into cells."""
         return _join_pair(split_line(line, self.separator), self.paired)
-
-
-def is_number(text: str, *, comma: bool = False) -> bool:
-    """Return whether a cell holds a plain decimal number (no words, no ``nan``)."""
-    text = text.strip()
-    return bool(_NUMBER.match(text.replace(",", ".") if comma else text))
 
 
 def unit_of_duration(text: str) -> str | None:
