@@ -13,7 +13,7 @@ import pytest
 
 from gyrostab.errors import OptionError
 from gyrostab.ingest import read_log, scan_file
-from gyrostab.ingest.columns import plan
+from gyrostab.store.toml import load_toml_folder
 
 RAD = math.degrees(1) * 3600  # deg/h
 IN_RADIANS = (0.001 * RAD, -0.002 * RAD, 0.003 * RAD)
@@ -189,9 +189,11 @@ def key_of(name: str) -> str:
     return name.split(",")[0]
 
 
-def test_each_preset_has_a_sample() -> None:
-    folder = Path(plan.__file__).with_name("presets")
-    assert {key_of(name) for name in SAMPLES} == {place.stem for place in folder.glob("*.toml")}
+def test_each_preset_has_a_sample_and_known_keys() -> None:
+    presets = load_toml_folder("gyrostab.ingest.columns", "presets")
+    assert {key_of(name) for name in SAMPLES} == set(presets)
+    keys = {"name", "above", "file", "needs", "times", "drops", "rate", "columns"}
+    assert [name for name, preset in presets.items() if not set(preset) <= keys] == []
 
 
 @pytest.mark.parametrize("name", SAMPLES)

@@ -123,6 +123,16 @@ class Header:
         return self.name.lower()
 
     @property
+    def written(self) -> str | None:
+        """Unit in the header, or stored outside it."""
+        return self.unit or self.stored
+
+    @property
+    def is_named(self) -> bool:
+        """Whether ``--map`` or the preset names the column."""
+        return self.mapped or self.preset
+
+    @property
     def may_rise(self) -> bool:
         """Whether the first cells rise, as far as they are known."""
         return not self.file.cells or self.file.is_rising
@@ -186,6 +196,12 @@ def _parse_or_none(parse: Callable[..., _T], *arguments: str) -> _T | None:
         return parse(*arguments)
     except GyrostabError:
         return None
+
+
+def time_suffix(name: str) -> str | None:
+    """Return the unit or form in the name of a time column, such as ``ms`` or ``utc``, or None."""
+    match = TIME_PATTERN.match(name.lower())
+    return next((text for text in match.groups() if text), None) if match else None
 
 
 def distinct_columns(columns: Sequence[FileColumn]) -> Iterator[Header]:

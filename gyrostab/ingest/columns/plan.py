@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from gyrostab.errors import FormatError, GyrostabError
 from gyrostab.ingest.columns.dates import YEAR_FIRST
@@ -37,7 +37,7 @@ from gyrostab.wording import list_some
 
 #: Columns that a message lists by name.
 MAX_HEADERS = 30
-_PRESET_KEYS = {"name", "above", "file", "needs", "times", "drops", "rate", "columns"}
+_load_folder = cache(load_toml_folder)
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class Plan:
 
     def leave_out(self, column: Header) -> None:
         """Add the summary of a column that is left out."""
-        self.add_summary(column, column.name, "left out", column.unit or column.stored)
+        self.add_summary(column, column.name, "left out", column.written)
 
     def add_column(self, column: Header, text: str | None, planned: Column) -> None:
         """Add a column to read, with the unit that the file or the user gives it."""
@@ -159,6 +159,7 @@ def name_columns(
     """Name the columns by ``--map``, then by the preset, and drop those that either drops."""
     keys_by_name = {key.strip().lower(): key for key in plan.options.map}
     targets = {split_header(target)[0].lower() for target in plan.options.map.values()}
+    are_axes_given = any(map(AXIS_PATTERN.match, targets))  # then the preset names none
     named: list[Header] = []
     for column in distinct_columns(columns):
         texts = (column.key.lower(), column.header.lower(), column.low)
@@ -171,7 +172,8 @@ def name_columns(
             column.name, column.unit, column.mapped = target, target_unit or column.unit, True
         elif preset := presets.get(column.source, columns[column.source].target):
             target, target_unit = split_header(preset)
-            if target == "-" or _is_taken(target.lower(), targets):
+            is_axis = bool(AXIS_PATTERN.match(target.lower()))
+            if target == "-" or target.lower() in targets or (is_axis and are_axes_given):
                 plan.leave_out(column)
                 continue
             column.name, column.preset = target, True
@@ -219,28 +221,12 @@ def resolve_duplicates(plan: Plan, named: list[Header]) -> list[Header]:
     return [column for column in named if column.source not in dropped]
 
 
-def _is_taken(target: str, asked: set[str]) -> bool:
-    """Return whether --map names a column for this target, or for any axis if it is an axis."""
-    return target in asked or (
-        bool(AXIS_PATTERN.match(target)) and any(AXIS_PATTERN.match(name) for name in asked)
-    )
-
-
 class PresetMatch(NamedTuple):
     """A preset that fits a file: column number -> target of ``--map``; rate [Hz] if known."""
 
     name: str = ""
     columns: Mapping[int, str] = MappingProxyType({})
     rate: float | None = None
-
-
-@cache
-def _load_presets() -> dict[str, dict[str, Any]]:
-    """Load the presets, by file name."""
-    presets = load_toml_folder("gyrostab.ingest.columns", "presets")
-    for name, preset in presets.items():
-        assert set(preset) <= _PRESET_KEYS, f"{name}: {set(preset) - _PRESET_KEYS}"
-    return presets
 
 
 def find_preset(
@@ -260,7 +246,7 @@ def find_preset(
     def held(names: Sequence[str]) -> list[int]:
         return [places[name.lower()] for name in names if name.lower() in places]
 
-    for key, preset in _load_presets().items():
+    for key, preset in _load_folder("gyrostab.ingest.columns", "presets").items():
         gyro = [names for target, names in preset["columns"].items() if target.startswith("gyro_")]
         if (
             not all(map(held, [*gyro, *([name] for name in preset.get("needs", ()))]))

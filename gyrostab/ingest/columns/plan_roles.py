@@ -265,7 +265,7 @@ def _note_temperatures(plan: Plan, rest: list[Header]) -> None:
     temperatures = []
     for column in rest:
         key = plan.unit_key((column.low, column.key, column.header))
-        unit = column.unit or column.stored or (options.unit[key] if key else "")
+        unit = column.written or (options.unit[key] if key else "")
         if is_unit_of(unit, ("temperature",)):
             temperatures.append(column)
     if temperatures and not any(column.mapped for column in temperatures):
@@ -345,7 +345,7 @@ def _axis_options(column: Header) -> str:
 
 def _may_be_axis(column: Header) -> bool:
     """Return whether unit and values of a column allow a gyro axis."""
-    unit = column.unit or column.stored or "1"
+    unit = column.written or "1"
     has_other_unit = is_unit(unit) and not is_unit_of(unit, ("rate", "angle", "number"))
     return not (has_other_unit or column.file.stamped)
 

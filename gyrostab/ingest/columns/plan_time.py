@@ -18,6 +18,7 @@ from gyrostab.ingest.columns.headers import (
     Header,
     is_time_unit,
     split_header,
+    time_suffix,
 )
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_unit
@@ -33,11 +34,9 @@ def find_time(plan: Plan, named: list[Header]) -> Header | None:
     ]
     if not time_columns:
         time_columns = [
-            c
-            for c in named
-            if not (c.mapped or c.preset) and TIME_PATTERN.match(c.low) and _may_be_time(c)
+            c for c in named if not c.is_named and TIME_PATTERN.match(c.low) and _may_be_time(c)
         ]
-        sure = [c for c in time_columns if c.low != "t" or c.unit or c.stored or c.file.stamped]
+        sure = [c for c in time_columns if c.low != "t" or c.written or c.file.stamped]
         time_columns = sure or time_columns
     if not time_columns:
         time_columns = [
@@ -45,7 +44,7 @@ def find_time(plan: Plan, named: list[Header]) -> Header | None:
             for c in named
             if c.file.stamped
             and c.may_rise
-            and not (c.mapped or c.preset)
+            and not c.is_named
             and not (c.file.date_order in UNREADABLE and plan.options.rate is not None)
         ]
         reason = "it holds dates"
@@ -96,18 +95,20 @@ def find_time(plan: Plan, named: list[Header]) -> Header | None:
 
 
 def _may_be_time(column: Header) -> bool:
-    written = column.unit or column.stored
     # An epoch that cannot be read is reported, not ignored.
-    return written is None or column.file.stamped or names_epoch(written) or is_time_unit(written)
+    return column.written is None or column.file.stamped or _counts_time(column.written)
+
+
+def _counts_time(unit: str) -> bool:
+    return is_time_unit(unit) or names_epoch(unit)
 
 
 def _is_clock(column: Header) -> bool:
     """Return whether a column of another name has a unit of time, and values known to rise."""
-    unit = column.unit or column.stored
     return (
-        unit is not None
-        and (is_time_unit(unit) or names_epoch(unit))
-        and not (column.mapped or column.preset)
+        column.written is not None
+        and _counts_time(column.written)
+        and not column.is_named
         and not KNOWN_CHANNEL_PATTERN.match(column.low)
         and bool(column.file.cells)
         and column.file.is_rising
@@ -129,7 +130,7 @@ def _date_order(plan: Plan, column: Header) -> str:
         if order := parse_order(plan.options.unit[key]):
             plan.used_units.add(key)
             return order
-    order = parse_order(column.unit or column.stored or "") or column.file.date_order
+    order = parse_order(column.written or "") or column.file.date_order
     if order == NO_DATE:
         plan.refuse(
             UnitError,
@@ -147,8 +148,7 @@ def _date_order(plan: Plan, column: Header) -> str:
 
 
 def _time_unit(plan: Plan, column: Header) -> TimeUnit | None:
-    suffix = TIME_PATTERN.match(split_header(column.header)[0].lower())
-    named = next((text for text in suffix.groups() if text), None) if suffix else None
+    named = time_suffix(split_header(column.header)[0])
     written = column.unit or (
         named if named not in ("utc", "iso") and column.stored is None else None
     )

@@ -16,7 +16,8 @@ import os
 import struct
 import warnings
 import zlib
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import cache
@@ -33,8 +34,9 @@ from gyrostab.ingest.columns.headers import (
     KNOWN_CHANNEL_PATTERN,
     TIME_PATTERN,
     is_time_unit,
+    time_suffix,
 )
-from gyrostab.ingest.formats.packing import ATTRIBUTES
+from gyrostab.ingest.formats.packing import ATTRIBUTES, attribute_text
 from gyrostab.ingest.formats.tables import (
     StoredArray,
     Table,
@@ -132,23 +134,18 @@ def _make_table(path: Path, options: ReadOptions, stack: ExitStack) -> TablesOfF
 
 def _known_fields(headers: Sequence[str]) -> dict[int, str]:
     """Return structure fields with known unique names, ``gyro_x`` of ``S.gyro_x``."""
-    names = [header.rpartition(".")[2] for header in headers]
-    times = [place for place, name in enumerate(names) if TIME_PATTERN.match(name.lower())]
-    field_names = {
-        place: name.lower()
-        for place, name in enumerate(names)
-        if AXIS_PATTERN.match(name.lower()) or KNOWN_CHANNEL_PATTERN.match(name.lower())
-    }
-    field_names = {
+    names = [header.rpartition(".")[2].lower() for header in headers]
+    counts = Counter(names)
+    targets = {
         place: name
-        for place, name in field_names.items()
-        if list(field_names.values()).count(name) == 1
+        for place, name in enumerate(names)
+        if counts[name] == 1 and (AXIS_PATTERN.match(name) or KNOWN_CHANNEL_PATTERN.match(name))
     }
+    times = [place for place, name in enumerate(names) if TIME_PATTERN.match(name)]
     if len(times) == 1:
-        match = TIME_PATTERN.match(names[times[0]].lower())
-        suffix = next((text for text in match.groups() if text), None) if match else None
-        field_names[times[0]] = f"time [{suffix}]" if suffix and is_time_unit(suffix) else "time"
-    return {place: name for place, name in field_names.items() if "." in headers[place]}
+        suffix = time_suffix(names[times[0]])
+        targets[times[0]] = f"time [{suffix}]" if suffix and is_time_unit(suffix) else "time"
+    return {place: name for place, name in targets.items() if "." in headers[place]}
 
 
 def _columns_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iterator[TableColumn]:
@@ -165,21 +162,16 @@ def _columns_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iter
         yield from StoredArray(array, along).make_columns(names, attributes)
 
 
-def _find_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
-    """Yield names and arrays of numbers; descriptions of MATLAB objects are added to `objects`."""
+def _find_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterable[tuple[str, Any]]:
+    """Find names and arrays of numbers; descriptions of MATLAB objects are added to `objects`."""
     with path.open("rb") as file:
         head = file.read(1024)
     if b"MATLAB 7.3" in head[:128] or b"\x89HDF" in head or path.suffix.lower() in HDF_SUFFIXES:
-        yield from _find_hdf_arrays(path, stack, objects)
-        return
-    yield from read_arrays(path, objects)
+        return _find_hdf_arrays(path, stack, objects)
+    return read_arrays(path, objects)
 
 
-def _to_text(value: Any) -> str:
-    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
-
-
-def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterator[tuple[str, Any]]:
+def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> list[tuple[str, Any]]:
     import h5py
 
     check_global_heaps(path)
@@ -190,8 +182,7 @@ def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterat
     def visit(name: str | bytes, item: Any) -> None:
         if isinstance(name, bytes):  # h5py leaves a name that is not UTF-8 as it is
             name = name.decode("utf-8", "backslashreplace")
-        text = item.attrs.get("MATLAB_class", b"double")
-        kind = _to_text(text)
+        kind = attribute_text(item.attrs.get("MATLAB_class", b"double"))
         if "MATLAB_object_decode" in item.attrs and not name.startswith("#"):
             objects.append(f"a {kind} {name!r}")
             return
@@ -204,7 +195,7 @@ def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterat
             arrays.append((name.replace("/", "."), item))
 
     file.visititems(visit)
-    yield from arrays
+    return arrays
 
 
 @cache
