@@ -337,6 +337,41 @@ def test_a_slow_channel_with_its_own_stamps_is_read(tmp_path: Path, ending: str)
     assert joined.T_case.values == pytest.approx(celsius + 273.15)  # in K, as in the file
 
 
+def test_axes_along_two_dimensions_keep_their_stamps(tmp_path: Path) -> None:
+    start, step = np.datetime64("2026-03-14T08:00:00"), np.timedelta64(20, "ms")
+    times = start + np.arange(100) * step
+    variables = {
+        "gyro_x": ("time", np.arange(100.0), {"units": "deg/h"}),
+        "gyro_y": ("time_y", np.arange(90.0), {"units": "deg/h"}),
+    }
+    foreign = xr.Dataset(variables, coords={"time": times, "time_y": times[10:]})
+    foreign.to_netcdf(tmp_path / "foreign.nc")
+    assert scan_file(tmp_path / "foreign.nc").axes == ("x", "y")
+    log = regularise(read_log(tmp_path / "foreign.nc"))
+    assert log.rate.sel(axis="x").values.tolist() == list(range(100))
+    y = log.rate.sel(axis="y").values
+    assert np.isnan(y[:10]).all()
+    assert y[10:].tolist() == list(range(90))
+
+
+def test_unusable_stamps_of_a_slow_channel_are_named(tmp_path: Path) -> None:
+    units = {"units": "days since 2026-03-14", "calendar": "noleap"}
+    foreign = xr.Dataset(
+        {
+            "gyro_x": ("time", np.arange(4.0), {"units": "deg/h"}),
+            "T_case": ("day", [20.0, 21.0], {"units": "degC"}),
+        },
+        coords={
+            "time": ("time", np.arange(4.0), {"units": "s"}),
+            "day": ("day", [0.0, 1.0], units),
+        },
+    )
+    foreign.to_netcdf(tmp_path / "foreign.nc")
+    assert any("noleap" in note for note in scan_file(tmp_path / "foreign.nc").notes)
+    with pytest.raises(UnitError, match=r"foreign.nc: .*calendar 'noleap'"):
+        read_log(tmp_path / "foreign.nc")
+
+
 @pytest.mark.parametrize("name", ["rate", "axis", "count", "tau", "term", "gap_start", "gap", "N"])
 def test_a_channel_named_like_a_variable_of_gyrostab_gets_another_name(
     name: str, tmp_path: Path

@@ -169,7 +169,7 @@ def make_tables(stamps: Sequence[tuple[Any, str | None] | None]) -> list[Table]:
     for number, clock in enumerate(stamps):
         name, unit = ("gyro_x", "deg/h") if number == 0 else (f"a{number}", "degC")
         column = TableColumn((name,), np.arange(10.0), unit)
-        tables.append(Table(10, [column], *(clock or ())))
+        tables.append(Table(10, [column], TableColumn(("time",), *clock) if clock else None))
     return tables
 
 

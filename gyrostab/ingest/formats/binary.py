@@ -78,7 +78,7 @@ def _make_tables(path: Path, options: ReadOptions, *, needs_rate: bool) -> Table
         where = "" if layout.sync else "the last "
         notes.append(f"{where}{extra_bytes} bytes are not {expected}; is the layout right?")
     columns = [TableColumn((field.name,), partial(fetch, field)) for field in layout.fields]
-    return [Table(rows, columns, stamps, "ns")], notes
+    return [Table(rows, columns, stamps)], notes
 
 
 _scan_tables, _read_tables = make_reader(
@@ -113,12 +113,10 @@ def _count_time(
     options: ReadOptions,
     *,
     needs_rate: bool,
-) -> tuple[Any, list[str]]:
-    """Return the stamps by the counter of the layout [ns], and a note on lost messages."""
+) -> tuple[TableColumn | None, list[str]]:
+    """Return the stamps by the counter of the layout, and a note on lost messages."""
     counter = layout.counter
-    if counter is None:
-        return None, []
-    if options.rate is None and not needs_rate:
+    if counter is None or (options.rate is None and not needs_rate):
         return None, []
     if options.rate is None:
         raise OptionError(
@@ -133,7 +131,7 @@ def _count_time(
     notes = [f"by their counter, {lost} messages were lost"] if lost > 0 else []
     rate = float(options.rate)
     check_span(0, rate, int(numbers[-1]) + 1, path.name)
-    return grid_times(0, rate, numbers), notes
+    return TableColumn(("time",), grid_times(0, rate, numbers), "ns"), notes
 
 
 def _read_field(

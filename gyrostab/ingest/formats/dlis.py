@@ -14,6 +14,7 @@ import contextlib
 import logging
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,7 @@ def _make_table(frame: Any) -> Table | None:
         "TIME" in kind and channels[0].name == frame.index and is_time_unit(columns[0].unit or "")
     )
     if is_timed:
-        return Table(len(values), columns[1:], columns[0].values, columns[0].unit)
+        return Table(len(values), columns[1:], replace(columns[0], name=("time",)))
     return Table(len(values), columns)
 
 

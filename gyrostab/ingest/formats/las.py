@@ -49,7 +49,7 @@ def _read_curves(path: Path, options: ReadOptions) -> TablesOfFile:
         )
         for curve in curves
     ]
-    return [Table(rows, columns, dates)], ()
+    return [Table(rows, columns, None if dates is None else TableColumn(("time",), dates))], ()
 
 
 def _find_clock(

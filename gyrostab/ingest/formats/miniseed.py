@@ -107,7 +107,7 @@ def _group_traces(traces: list[_Trace]) -> list[Table]:
             )
             for trace in group
         ]
-        tables.append(Table(rows, columns, _trace_stamps(longest)))
+        tables.append(Table(rows, columns, TableColumn(("time",), _trace_stamps(longest))))
     return tables
 
 

@@ -24,20 +24,20 @@ import xarray as xr
 from gyrostab.errors import FormatError, SchemaError, TimeError
 from gyrostab.ingest.columns.headers import AXIS_PATTERN, split_header
 from gyrostab.ingest.columns.stamps import names_epoch
-from gyrostab.ingest.combine import attach_channels
 from gyrostab.ingest.concat.grid import log_span
 from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.formats.tables import (
     StoredArray,
     Table,
     TableColumn,
+    TablesOfFile,
     read_tables,
     scan_tables,
 )
 from gyrostab.ingest.limits import check_chunk, check_declared
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 from gyrostab.ingest.uniform import as_uniform
-from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name, texts
+from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
 from gyrostab.store.attributes import read_attribute
 from gyrostab.store.cf import from_disk
 from gyrostab.store.damage import check_blosc_chunks, check_global_heaps
@@ -70,11 +70,8 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
             return _summarise_log(path, log)
     with _open_undecoded(path) as stored:
         form = "zarr" if path.is_dir() else "netcdf"
-        main, slower, notes = _find_tables(path, stored, options)
-        summary = scan_tables(path, form, [main], options, notes)
-        others = (scan_tables(path, form, [table], _for_channels(options)) for table in slower)
-        names = [name for other in others for name in other.channels]
-        return replace(summary, channels=tuple(dict.fromkeys([*summary.channels, *names])))
+        tables, notes = _find_tables(path, stored, options)
+        return scan_tables(path, form, tables, options, notes)
 
 
 def read(path: Path, options: ReadOptions) -> xr.Dataset:
@@ -83,20 +80,11 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
     if log is not None:
         return log
     with _open_undecoded(path) as stored:
-        main, slower, notes = _find_tables(path, stored, options)
-        log = read_tables(path, [main], options, notes=notes)
-        for table in slower:
-            log = _add_channels(log, read_tables(path, [table], _for_channels(options)))
-        return log
+        tables, notes = _find_tables(path, stored, options)
+        return read_tables(path, tables, options, notes=notes)
 
 
-def _for_channels(options: ReadOptions) -> ReadOptions:
-    return replace(options, channels_only=True, start=None)
-
-
-def _find_tables(
-    path: Path, stored: xr.Dataset, options: ReadOptions
-) -> tuple[Table, list[Table], list[str]]:
+def _find_tables(path: Path, stored: xr.Dataset, options: ReadOptions) -> TablesOfFile:
     """Return a table of the main dimension, those of others that have stamps, and notes.
 
     The main dimension is the longest of those with gyro axes, otherwise the longest.
@@ -120,35 +108,24 @@ def _find_tables(
         for name, v in numeric.items()
         if v.ndim == 1 and names_epoch(str(v.attrs.get("units", "")))
     }
+    stamped.pop(main_dim, None)
     columns: dict[Any, list[TableColumn]] = {dim: [] for dim in (main_dim, *stamped)}
+    clocks: dict[Any, TableColumn] = {}
     left_out: list[str] = []
     for name, variable in numeric.items():
         dim = next((dim for dim in columns if dim in variable.dims), main_dim)
         variable_columns = _columns_of(variables, name, dim)
-        if dim != main_dim and name == stamped[dim]:
-            variable_columns = [replace(variable_columns[0], name=("time",))]
-        columns[dim] += variable_columns
+        if name == stamped.get(dim):
+            clocks[dim] = replace(variable_columns[0], name=("",))
+        else:
+            columns[dim] += variable_columns
         left_out += [] if variable_columns else [name]
     notes = (
         [f"left out, as they do not run along {main_dim!r} alone: {', '.join(left_out[:20])}"]
         if left_out
         else []
     )
-    main = Table(sizes[main_dim], columns.pop(main_dim))
-    slower = [Table(sizes[dim], part) for dim, part in columns.items() if len(part) > 1]
-    return main, slower, notes
-
-
-def _add_channels(log: xr.Dataset, part: xr.Dataset) -> xr.Dataset:
-    """Add the channels of another dimension, each on ``time_<channel>``."""
-    part = part.drop_vars([name for name in part.data_vars if name in log.variables])
-    lists = {
-        name: list(dict.fromkeys([*texts(log, name), *texts(part, name)]))
-        for name in ("notes", "headers")
-    }
-    unmatched = set(texts(log, "unmatched_options")) & set(texts(part, "unmatched_options"))
-    log = log.assign_attrs(lists, unmatched_options=sorted(unmatched))
-    return attach_channels(log, [part]) if part.data_vars else log
+    return [Table(sizes[dim], part, clocks.get(dim)) for dim, part in columns.items()], notes
 
 
 def _holds_axes(name: str, variable: xr.Variable, options: ReadOptions) -> bool:
@@ -290,7 +267,7 @@ def _open_remote(path: Path, url: str) -> xr.Dataset:
 
 
 def _is_regular(path: Path) -> bool:
-    """Return whether a file has signal, axes, stamps and sampling rate, as a regular log has.
+    """Return whether a file has signal, axes, stamps and sampling rate, as xarray decodes them.
 
     The signal of a NetCDF file needs a fill value: without one, samples that were not written have
     that of the library, which xarray does not take for missing.
@@ -304,7 +281,11 @@ def _is_regular(path: Path) -> bool:
             and any(path.is_dir() or "_FillValue" in signal.attrs for signal in signals)
             and stamps is not None
             and _is_dated(stamps)
-            and all(_decodes_as_cf(variable.attrs) for variable in stored.variables.values())
+            and all(
+                np.all(item.attrs.get("_FillValue", 1))  # 0 is the default of Zarr
+                and not _VALID_RANGES & set(item.attrs)
+                for item in stored.variables.values()
+            )
         )
 
 
@@ -336,12 +317,6 @@ def _check_classic_header(path: Path) -> None:
             f"{path.name}: the header of this NetCDF file is damaged or cut off ({error}); copy "
             "it again"
         ) from error
-
-
-def _decodes_as_cf(attributes: dict[Any, Any]) -> bool:
-    """Return whether xarray decodes numbers by the CF conventions; 0 is the default of Zarr."""
-    is_default_fill = not np.all(attributes.get("_FillValue", 1))
-    return not is_default_fill and not _VALID_RANGES & set(attributes)
 
 
 def _is_dated(stamps: xr.Variable) -> bool:

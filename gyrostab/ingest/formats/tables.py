@@ -21,7 +21,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.errors import FormatError, OptionError
+from gyrostab.errors import FormatError, OptionError, UnitError
 from gyrostab.ingest.columns.headers import FileColumn
 from gyrostab.ingest.columns.plan import MAX_HEADERS, Column, Plan
 from gyrostab.ingest.columns.plan_roles import plan_columns
@@ -99,13 +99,13 @@ class StoredArray:
 class Table:
     """Columns of one length, and the stamps: numbers of a unit, or dates without one.
 
-    Without stamps a column of the table may hold the time.
+    Stamps without a name are not the time of the log, but only of channels. Without stamps a column
+    of the table may hold the time.
     """
 
     rows: int
     columns: Sequence[TableColumn]
-    stamps: Any = None  # as the values of a column
-    time_unit: str | None = None
+    stamps: TableColumn | None = None
 
 
 #: Tables of a file, and notes on it.
@@ -152,7 +152,7 @@ class Messages:
             for name, column in self.columns.items()
         ]
         clock = stamps if time_unit else stamps.view("datetime64[ns]")
-        return Table(len(stamps), columns, clock, time_unit)
+        return Table(len(stamps), columns, TableColumn(("time",), clock, time_unit))
 
     def _fill_column(self, column: array[float]) -> None:
         if len(column) < len(self.stamps):
@@ -190,16 +190,8 @@ class _PlannedTables:
         begin, end = self.first[place : place + 2]
         columns = [column for column in self.plan.columns if begin <= column.source < end]
         if self.tables[place].stamps is not None:
-            clocks = [self._clock_of(begin, clock) for clock in self.plan.of("time")]
-            columns = clocks + [c for c in columns if not (clocks and c.role == "time")]
+            columns = [c for c in columns if c.role != "time" or c.source == begin]
         return replace(self.plan, columns=columns)
-
-    def _clock_of(self, source: int, planned: Column) -> Column:
-        """Return the stamps of a table, in the planned unit if both clocks are stored in one."""
-        unit, time_unit = self.stored[source].unit, planned.time_unit
-        if unit != self.stored[planned.source].unit:
-            time_unit = parse_time_unit(unit) if unit else None
-        return replace(planned, source=source, time_unit=time_unit)
 
     def fetch(self, source: int, start: int, stop: int) -> Any:
         """Return the values of a column, decoded."""
@@ -253,28 +245,52 @@ def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _
         own_names = list(islice(names, len(table.columns)))
         if not own_names or not (table.rows or table.columns[0].attributes is not None):
             continue
-        is_timed = table.stamps is not None
-        is_first_clock = is_timed and all(held.stamps is None for held in filled)
-        filled.append(table)
         first.append(len(stored))
-        if is_timed:
-            stored.append(TableColumn(("",), table.stamps, table.time_unit))
-            header, stamped = "time" if is_first_clock else "", table.time_unit is None
-            described.append(FileColumn(header, table.time_unit, stamped=stamped))
-        for name, column in zip(own_names, table.columns, strict=True):
-            calendar = attribute_text((column.attributes or {}).get("calendar")) or None
-            stored.append(column)
-            described.append(FileColumn(name, column.unit, calendar, target=column.target))
+        if table.stamps is not None:
+            is_first_clock = all(held.stamps is None for held in filled)
+            header = table.stamps.name[-1] if is_first_clock else ""
+            described.append(_describe(table.stamps, header, stamped=table.stamps.unit is None))
+            stored.append(table.stamps)
+        filled.append(table)
+        described += map(_describe, table.columns, own_names)
+        stored += table.columns
     if not filled:
         raise FormatError(
             f"{path.name}: it holds no values; copy it again, or check what the logger wrote"
         )
-    plan, decoders = fold_packing(plan_columns(path, described, options), stored)
+    plan = plan_columns(path, described, options)
+    for begin, table in zip(first, filled, strict=True):
+        if table.stamps is not None:
+            _add_clock(plan, begin, described, is_named=bool(table.stamps.name[-1]))
+    plan, decoders = fold_packing(plan, stored)
     main_columns = plan.of("gyro") or plan.of("channel")
     holders = {bisect_right(first, column.source) - 1 for column in main_columns}
     main = sorted(holders) if plan.of("gyro") else [min(holders, default=0)]
     planned = _PlannedTables(filled, stored, [*first, len(stored)], plan, decoders, main)
     return _leave_out_unplaced(planned)
+
+
+def _describe(column: TableColumn, name: str, *, stamped: bool = False) -> FileColumn:
+    calendar = attribute_text((column.attributes or {}).get("calendar")) or None
+    return FileColumn(name, column.unit, calendar, stamped=stamped, target=column.target)
+
+
+def _add_clock(plan: Plan, source: int, described: Sequence[FileColumn], *, is_named: bool) -> None:
+    """Plan the stamps of a table, as planned if both clocks are stored in one unit."""
+    own, time = described[source], plan.time
+    if (time is None and is_named) or any(column.source == source for column in plan.of("time")):
+        return  # the user leaves out the stamps, or they are planned
+    planned = Column(source, own.header, "time", "time", "ns", epoch=plan.options.epoch_ns)
+    if time is not None and replace(described[time.source], header="") == replace(own, header=""):
+        planned = replace(time, source=source)
+    elif own.unit is not None:
+        try:
+            unit = parse_time_unit(own.unit, own.calendar)
+        except UnitError as error:
+            plan.refuse(UnitError, str(error))
+            return
+        planned = replace(planned, time_unit=unit)
+    plan.columns.append(planned)
 
 
 def scan_tables(

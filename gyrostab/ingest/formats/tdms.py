@@ -84,12 +84,13 @@ def _make_table(path: Path, channels: list[Any]) -> Table:
     clock = _waveform_clock(path, channels[0])
     if clock is not None:
         unit = None if isinstance(clock[1], np.datetime64) else "ns"
-        return Table(len(channels[0]), columns, _waveform_stamps(*clock), unit)
+        stamps = TableColumn(("time",), _waveform_stamps(*clock), unit)
+        return Table(len(channels[0]), columns, stamps)
     kinds = [np.dtype(channel.dtype).kind for channel in channels]
     if "M" not in kinds:
         return Table(len(channels[0]), columns)
     dates = columns.pop(kinds.index("M"))
-    return Table(len(channels[0]), columns, dates.values)
+    return Table(len(channels[0]), columns, TableColumn(("time",), dates.values))
 
 
 def _waveform_stamps(step: float, start: Any) -> Callable[[int, int], Any]:

@@ -39,7 +39,9 @@ def _make_tables(path: Path, options: ReadOptions) -> TablesOfFile:
         fields = {field: values for field, values in message.data.items() if field != "timestamp"}
         columns = [TableColumn((name, field), values) for field, values in fields.items()]
         rows = len(next(iter(fields.values()), ()))
-        tables.append(Table(rows, columns, message.data.get("timestamp"), "us"))
+        stamps = message.data.get("timestamp")
+        clock = None if stamps is None else TableColumn(("time",), stamps, "us")
+        tables.append(Table(rows, columns, clock))
     notes = []
     if lost := [dropout.duration for dropout in log.dropouts]:
         notes.append(

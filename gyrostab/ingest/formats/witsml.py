@@ -70,7 +70,7 @@ def _make_table(log: Any) -> Table | None:
         for number, name in enumerate(names)
         if number != place
     ]
-    return Table(len(cells), columns, stamps)
+    return Table(len(cells), columns, TableColumn(("time",), stamps))
 
 
 def _child_text(parent: Any, name: str) -> str:
