@@ -26,13 +26,15 @@ from gyrostab.ingest.columns.headers import (
     is_unit_of,
     quantity_of,
 )
-from gyrostab.ingest.guess_time import (
+from gyrostab.ingest.guess_unit import (
     TYPICAL_RATE_HZ,
+    given_unit,
     guess_time,
+    guess_unit,
+    name_unit,
     rises_by_row,
     unit_seconds,
 )
-from gyrostab.ingest.guess_unit import given_unit, guess_unit, name_unit
 from gyrostab.ingest.inspect import ColumnInspection, FileInspection
 from gyrostab.time.durations import format_duration
 

@@ -113,16 +113,6 @@ class InspectedFile:
     row: dict[str, Any] | None  # row of the table, read with these options
     error: GyrostabError | None  # why these options do not read it, if there is a gyro
 
-    @property
-    def holds_channels(self) -> bool:
-        """Whether the file has stamps and channels but no gyro."""
-        columns = self.inspection.summary.columns
-        return (
-            not self.guess.axes
-            and self.inspection.time is not None
-            and any(column.role == "channel" for column in columns)
-        )
-
 
 @dataclass(frozen=True)
 class ScanResult:
@@ -154,12 +144,12 @@ def scan_and_inspect(
             inspected_file = _inspect_once(path, reading, inspected) if inspect else None
             failure = None if inspected_file is None or reading else inspected_file.error
             errors.append(failure or error)
-            rows.append({"file": given_name(path), "odd": str(errors[-1])})
+            row: dict[str, Any] = {"file": given_name(path), "odd": str(errors[-1])}
             if inspected_file is not None and inspected_file.error is None:
-                rows[-1].update(format=inspected_file.inspection.summary.format)
-                rows[-1].update(
-                    rows=inspected_file.inspection.rows if inspected_file.paths == [path] else None
-                )
+                row["format"] = inspected_file.inspection.summary.format
+                if inspected_file.paths == [path]:
+                    row["rows"] = inspected_file.inspection.rows
+            rows.append(row)
     return ScanResult(
         pd.DataFrame(rows, columns=list(COLUMNS)),
         errors,
@@ -232,7 +222,13 @@ def _try_guess(
 
 def add_channels(options: dict[str, Any], inspected: Sequence[InspectedFile]) -> dict[str, Any]:
     """Return options that also read the channels of the files without a gyro."""
-    files = [file for file in inspected if file.holds_channels]
+    files = [
+        file
+        for file in inspected
+        if not file.guess.axes
+        and file.inspection.time is not None
+        and any(column.role == "channel" for column in file.inspection.summary.columns)
+    ]
     if not files:
         return options
     paths = [path for file in files for path in file.paths]
