@@ -72,7 +72,9 @@ class RawLogBuilder:
         if self.time is not None:
             dtypes[self.time.source] = "datetime64[ns]"
         self.buffers = Buffers(dtypes)
-        self.faults = Faults()
+        self.bad_cells = self.gyro_cells = 0  # the latter in rows that are readable otherwise
+        self.bad_rows, self.cell_rows = _Places(), _Places()
+        self.missing: Counter[int] = Counter()  # missing values by column number
         #: Range of the stamps of readable rows [ns since 1970]; high < low if there are none.
         self.low, self.high = np.iinfo(np.int64).max, NAT
         unit = None if self.time is None else self.time.time_unit
@@ -121,10 +123,16 @@ class RawLogBuilder:
         if converted.rows == 0:
             return
         for source, (missing, low, high, is_whole) in converted.ranges.items():
+            self.missing[source] += missing
             span = self.whole[source]
             if span is not None and missing < converted.rows:
                 self.whole[source] = (min(span[0], low), max(span[1], high)) if is_whole else None
-        self.faults.add(converted, self.buffers.rows, locate, quote)
+        first = self.buffers.rows
+        locate = locate or (lambda rows: [f"row {first + row}" for row in rows])
+        self.bad_rows.add(converted.bad_rows, locate, quote)
+        self.cell_rows.add(converted.cell_rows, locate)
+        self.bad_cells += converted.bad_cells
+        self.gyro_cells += converted.cells
         block: dict[int, Any] = {**converted.values}
         stamps = converted.stamps
         if stamps is not None and self.time is not None:
@@ -153,13 +161,13 @@ class RawLogBuilder:
                 f"{name}: there is a header but no data row below it; copy it again, or check "
                 "what the logger wrote"
             )
-        self.faults.check(name, rows)
+        self._check_share(name, rows)
         columns = self.buffers.finish()
         notes = [
             *self.plan.notes,
             *notes,
             *describe_codes([*self.gyro, *self.channels], columns),
-            *self.faults.describe(rows, self.gyro),
+            *self._describe_faults(rows),
             *(self.clock.describe() if self.clock is not None else ()),
         ]
         if self.options.start is not None and self.time is not None:
@@ -170,18 +178,45 @@ class RawLogBuilder:
             source_files=[name],
             row_start=[0],
             notes=[f"{name}: {note}" for note in notes],
-            unreadable_rows=self.faults.rows.total,
-            unreadable_cells=self.faults.cells,
+            unreadable_rows=self.bad_rows.total,
+            unreadable_cells=self.bad_cells,
             unmatched_options=self.plan.unmatched,
             headers=[summary.header for summary in self.plan.summaries],
         )
         return dataset
 
+    def _check_share(self, name: str, rows: int) -> None:
+        """Refuse a file of which more than half of the rows are unreadable."""
+        if self.bad_rows.total > MAX_UNREADABLE_SHARE * rows:
+            share, first = self.bad_rows.total / rows, self.bad_rows.names[0]
+            suspects = (
+                "the separator, the columns that --map names and the unit of time (stamps lie "
+                "in the years 1678 to 2262)"
+            )
+            raise FormatError(
+                f"{name}: {100 * share:.0f} % of {rows} rows are unreadable, the first is {first}"
+                f"{self.bad_rows.first}; look at it, and check {suspects}"
+            )
+
+    def _describe_faults(self, rows: int) -> list[str]:
+        """Return notes on unreadable rows, and on gyro cells in other rows."""
+        notes, bad = [], self.bad_rows
+        if bad.total:
+            notes.append(f"{bad.total} of {rows} rows are unreadable: {bad.describe()}")
+        empty = sum(self.missing[column.source] == rows for column in self.gyro)
+        cells = self.gyro_cells - empty * (rows - bad.total)  # empty axes have a note later
+        if cells:
+            places = "" if empty else f": {self.cell_rows.describe()}"
+            notes.append(
+                f"{cells} gyro cells hold no number in rows that are readable otherwise{places}"
+            )
+        return notes
+
     def _finish_stamps(self, columns: dict[int, Any]) -> Any:
         if self.time is None:
             return None
         stamps = columns.pop(self.time.source)
-        if not self.faults.rows.total or self.low > self.high:
+        if not self.bad_rows.total or self.low > self.high:
             return stamps
         hide = partial(_hide_others, low=self.low, high=self.high)
         if isinstance(stamps, np.ndarray):
@@ -280,12 +315,14 @@ def summary_of(
 
 
 class _Places:
-    """Number of bad places, and the names of the first ones."""
+    """Number of bad places, the names of the first ones, and the first one as it is written."""
 
     def __init__(self) -> None:
-        self.total, self.names = 0, list[str]()
+        self.total, self.names, self.first = 0, list[str](), ""
 
-    def add(self, rows: NDArray[np.int64], locate: Locate) -> None:
+    def add(self, rows: NDArray[np.int64], locate: Locate, quote: Quote | None = None) -> None:
+        if quote is not None and rows.size and not self.total:
+            self.first = f": {quote(int(rows[0])):.100}"
         self.total += len(rows)
         if room := MAX_NAMED_PLACES - len(self.names):
             self.names += locate(rows[:room].tolist())
@@ -297,58 +334,6 @@ class _Places:
         return (
             f"{kind}{'s' * (len(names) > 1)} {numbers}{' and others' * (self.total > len(names))}"
         )
-
-
-class Faults:
-    """Unreadable rows and cells of the blocks of a file."""
-
-    def __init__(self) -> None:
-        self.cells = self.gyro_cells = 0  # the latter in rows that are readable otherwise
-        self.rows, self.cell_rows = _Places(), _Places()
-        self.missing: Counter[int] = Counter()  # missing values by column number
-        self.first_row = ""
-
-    def add(
-        self, block: ConvertedBlock, first: int, locate: Locate | None, quote: Quote | None
-    ) -> None:
-        """Add those of a block whose first row has the number `first`."""
-        locate = locate or (lambda rows: [f"row {first + row}" for row in rows])
-        self.cells += block.bad_cells
-        self.missing.update({source: span[0] for source, span in block.ranges.items()})
-        if block.bad_rows.size:
-            if quote is not None and not self.rows.total:
-                self.first_row = f": {quote(int(block.bad_rows[0])):.100}"
-            self.rows.add(block.bad_rows, locate)
-        if block.cell_rows.size:
-            self.cell_rows.add(block.cell_rows, locate)
-            self.gyro_cells += block.cells
-
-    def check(self, name: str, rows: int) -> None:
-        """Refuse a file of which more than half of the rows are unreadable."""
-        if self.rows.total > MAX_UNREADABLE_SHARE * rows:
-            share, first = self.rows.total / rows, self.rows.names[0]
-            suspects = (
-                "the separator, the columns that --map names and the unit of time (stamps lie "
-                "in the years 1678 to 2262)"
-            )
-            raise FormatError(
-                f"{name}: {100 * share:.0f} % of {rows} rows are unreadable, the first is {first}"
-                f"{self.first_row}; look at it, and check {suspects}"
-            )
-
-    def describe(self, rows: int, gyro: Sequence[Column]) -> list[str]:
-        """Return notes on unreadable rows, and on gyro cells in other rows."""
-        notes = []
-        if self.rows.total:
-            notes.append(f"{self.rows.total} of {rows} rows are unreadable: {self.rows.describe()}")
-        empty = sum(self.missing[column.source] == rows for column in gyro)
-        cells = self.gyro_cells - empty * (rows - self.rows.total)  # empty axes have a note later
-        if cells:
-            places = "" if empty else f": {self.cell_rows.describe()}"
-            notes.append(
-                f"{cells} gyro cells hold no number in rows that are readable otherwise{places}"
-            )
-        return notes
 
 
 def describe_codes(columns: Sequence[Column], values: Mapping[int, Any]) -> list[str]:
