@@ -48,7 +48,7 @@ MIN_SCORE = 1.5
 CUMULATIVE_STEP_SHARE = 0.1
 
 _STRONG = re.compile(
-    r"gyr|omega|ang(ular)?[ _.]?(rate|vel)|rot(ation)?[ _.]?(rate|vel)|turn[ _.]?rate|uncompgyro"
+    r"gyr|omega|ang(ular)?[ _.]?(rate|vel)|rot(ation)?[ _.]?(rate|vel)|turn[ _.]?rate"
 )
 
 _LETTER = re.compile(r"(^|[^a-z])[wg]_?\*|w_rs_s_\*|(^|[^a-z])rate|^\*?j\*$")

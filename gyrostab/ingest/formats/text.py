@@ -91,7 +91,7 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
         line += parsed.lines
     raw = builder.finish(layout.notes)
     if plan.time is not None and plan.time.time_unit is None:
-        cells = [row[plan.time.source] for row in layout.full_samples]
+        cells = [row[plan.time.source] for row in layout.samples]
         raw.attrs["local_time"] = not any(map(has_offset, cells))
     return raw
 
@@ -107,7 +107,7 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
         layout = find_layout(path, head, complete=len(head) < size, limits=options.limits)
     columns = []
     for place, header in enumerate(layout.headers):
-        cells = [row[place] for row in layout.full_samples]
+        cells = [row[place] for row in layout.samples]
         if layout.decimal_comma:
             cells = [c.replace(",", ".") if is_number(c, comma=True) else c for c in cells]
         unit = layout.units.get(place) or _duration_unit(cells)
@@ -127,7 +127,7 @@ def _duration_unit(cells: Sequence[str]) -> str | None:
 def _sample_stamps(
     layout: Layout, time: Column, rows: Sequence[Sequence[str]]
 ) -> NDArray[np.int64]:
-    cells = [row[time.source] for row in rows if len(row) == layout.width]
+    cells = [row[time.source] for row in rows]
     if layout.decimal_comma and time.time_unit is not None:
         cells = [cell.replace(",", ".") for cell in cells]
     return cells_to_ns(cells, time.time_unit, time.epoch, time.date_order)

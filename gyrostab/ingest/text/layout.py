@@ -41,7 +41,7 @@ class Layout:
     """Layout of a text log.
 
     `offset` [bytes] and `line` (from 1) give the first data row; `samples` holds the cells of the
-    first few rows.
+    first few rows, without those that have too few or too many.
     """
 
     headers: tuple[str, ...]
@@ -61,11 +61,6 @@ class Layout:
     def width(self) -> int:
         """Number of cells in a row."""
         return len(self.headers)
-
-    @property
-    def full_samples(self) -> list[tuple[str, ...]]:
-        """The first few rows, without those that have too few or too many cells."""
-        return [row for row in self.samples if len(row) == self.width]
 
     def split_row(self, line: str) -> list[str]:
         """Split a data row into cells."""
@@ -150,10 +145,11 @@ def find_layout(
         )
     has_point = any("." in cell and is_number(cell) for row in rows for cell in row)
     comma = separator in COMMA_SEPARATORS and not has_point
-    notes += _describe_sources(headers, rows)
+    samples = [row for row in rows if len(row) == len(headers)]
+    notes += _describe_sources(headers, samples)
     top = tuple(lines[:above]) if header is not None else ()
     return Layout(
-        tuple(headers), separator, offset, first + 1, tuple(rows[:50]), comma, tuple(notes), top,
+        tuple(headers), separator, offset, first + 1, tuple(samples[:50]), comma, tuple(notes), top,
         paired, units,
     )  # fmt: skip
 
@@ -205,8 +201,7 @@ def _find_pair(rows: Sequence[Sequence[str]]) -> int | None:
 def _describe_sources(headers: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Return a note on each column of words that alternate from row to row."""
     notes = []
-    full_rows = [row for row in rows if len(row) == len(headers)]
-    for header, *cells in zip(headers, *full_rows, strict=True):
+    for header, *cells in zip(headers, *rows, strict=True):
         values = list(dict.fromkeys(cell.strip() for cell in cells))
         changes = sum(before.strip() != after.strip() for before, after in pairwise(cells))
         if (
