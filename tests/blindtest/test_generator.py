@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from gyrostab.blindtest.generator import coil, electronics, light, loop, telemetry, tool, vibration
+from gyrostab.blindtest.generator import electronics, instrument, telemetry
 from gyrostab.blindtest.generator import noise_floor as floor
 from gyrostab.blindtest.scoring.baseline_detectors import (
     allan_band,
@@ -24,9 +24,9 @@ from gyrostab.blindtest.scoring.baseline_detectors import (
 
 @pytest.mark.parametrize(("thickness", "diffusivity"), [(0.012, 2.2e-7), (0.007, 3e-7)])
 def test_coil_step_response_decays_with_the_slowest_mode(thickness, diffusivity):
-    tau = coil.diffusion_time(thickness, diffusivity)
+    tau = instrument.diffusion_time(thickness, diffusivity)
     face = np.r_[20.0, np.full(round(8 * tau), 30.0)]
-    inner = coil.layer_temperatures(
+    inner = instrument.layer_temperatures(
         face, dt=1.0, layers=48, thickness=thickness, diffusivity=diffusivity
     )[-1]
     late = slice(round(3 * tau), round(6 * tau))
@@ -36,7 +36,7 @@ def test_coil_step_response_decays_with_the_slowest_mode(thickness, diffusivity)
 
 def test_coil_lags_a_steady_ramp_by_a_parabola():
     d, kappa, speed, layers = 0.012, 2.2e-7, 1 / 60, 48
-    layer = coil.layer_temperatures(
+    layer = instrument.layer_temperatures(
         speed * np.arange(4000.0), dt=1.0, layers=layers, thickness=d, diffusivity=kappa
     )[:, -1]
     x = (np.arange(layers) + 0.5) * d / layers
@@ -47,7 +47,9 @@ def test_coil_lags_a_steady_ramp_by_a_parabola():
 def test_coil_conserves_heat():
     d, kappa, layers = 0.012, 2.2e-7, 24
     face = 20 + 5 * np.sin(np.arange(2000) / 150.0)
-    layer = coil.layer_temperatures(face, dt=1.0, layers=layers, thickness=d, diffusivity=kappa)
+    layer = instrument.layer_temperatures(
+        face, dt=1.0, layers=layers, thickness=d, diffusivity=kappa
+    )
     into = (
         kappa * (face - layer[0]) / (d / layers / 2)
     )  # through half a cell, per unit of area and heat capacity
@@ -57,8 +59,8 @@ def test_coil_conserves_heat():
 
 def test_quadrupole_cancels_shupe_except_for_trim_error():
     ramp = 20 + np.arange(3000) / 60.0
-    speed = np.gradient(coil.layer_temperatures(ramp, dt=1.0, layers=24), axis=1)[:, -1]
-    even, trimmed = (coil.layer_weights(24, trim=trim) @ speed for trim in (0.0, 1e-3))
+    speed = np.gradient(instrument.layer_temperatures(ramp, dt=1.0, layers=24), axis=1)[:, -1]
+    even, trimmed = (instrument.layer_weights(24, trim=trim) @ speed for trim in (0.0, 1e-3))
     expected = 2e-3 * 500**2 / 60  # half to half asymmetry of 2 trim: 2 trim L^2 dT/dt
     assert abs(even) < 1e-3 * expected
     assert trimmed == pytest.approx(expected, rel=1e-3)
@@ -66,13 +68,13 @@ def test_quadrupole_cancels_shupe_except_for_trim_error():
 
 def test_detector_noise_terms_have_their_power_laws():
     power = np.array([1e-6, 4e-6])
-    shot = light.relative_psd(power, rin=0.0, load=1e12)
-    thermal = light.relative_psd(power, rin=0.0, load=1.0)
-    excess = light.relative_psd(power, rin=1e-7)
+    shot = instrument.relative_psd(power, rin=0.0, load=1e12)
+    thermal = instrument.relative_psd(power, rin=0.0, load=1.0)
+    excess = instrument.relative_psd(power, rin=1e-7)
     assert shot[0] / shot[1] == pytest.approx(4.0, rel=1e-3)
     assert thermal[0] / thermal[1] == pytest.approx(16.0, rel=1e-3)
     assert excess[0] / excess[1] == pytest.approx(1.0, rel=1e-3)
-    assert light.detector_psd(np.array([1e-5]))["shot"][0] == pytest.approx(
+    assert instrument.detector_psd(np.array([1e-5]))["shot"][0] == pytest.approx(
         2 * 1.602176634e-19 * 0.9e-5
     )
 
@@ -81,32 +83,34 @@ def test_shot_noise_level_matches_textbook():
     power, depth = 20e-6, math.pi / 2
     detected = power * (1 + math.cos(depth))
     phase = (
-        math.sqrt(2 * light.CHARGE / (0.9 * detected))
+        math.sqrt(2 * 1.602176634e-19 / (0.9 * detected))
         * (1 + math.cos(depth))
         / math.sin(depth)
         / math.sqrt(2)
     )
-    level = light.relative_psd(np.array([power]), rin=0.0, load=1e12, depth=depth)[0]
+    level = instrument.relative_psd(np.array([power]), rin=0.0, load=1e12, depth=depth)[0]
     assert math.sqrt(level / 2) == pytest.approx(phase, rel=1e-3)
 
 
 def test_reset_count_follows_the_rate():
     rate, seconds, dt = 22.0, 500.0, 0.01
-    phase = loop.ramp_phase(np.full(round(seconds / dt), rate), dt=dt)
+    phase = instrument.ramp_phase(np.full(round(seconds / dt), rate), dt=dt)
     expected = 0.04 * math.radians(rate / 3600) / (1.45 * 1.55e-6) * seconds
     assert (np.diff(phase) < 0).sum() == math.floor(expected)
 
 
 def test_dead_zone_holds_at_zero_and_is_odd():
     w = np.linspace(-1, 1, 201)
-    out = loop.dead_zone(w, width=0.3)
+    out = instrument.dead_zone(w, width=0.3)
     assert (out[np.abs(w) <= 0.3] == 0).all()
     np.testing.assert_allclose(out, -out[::-1], atol=1e-7)
 
 
 def test_mount_has_the_response_of_a_damped_spring():
     f = np.array([10.0, 60.0, 120.0, 400.0])
-    _, got = signal.freqz(*vibration.mount_filter(120.0, quality=8.0), worN=f, fs=vibration.FAST_HZ)
+    _, got = signal.freqz(
+        *instrument.mount_filter(120.0, quality=8.0), worN=f, fs=instrument.FAST_HZ
+    )
     x = f / 120.0
     expected = np.sqrt((1 + (x / 8) ** 2) / ((1 - x**2) ** 2 + (x / 8) ** 2))
     np.testing.assert_allclose(
@@ -117,11 +121,12 @@ def test_mount_has_the_response_of_a_damped_spring():
 @pytest.mark.parametrize(("kind", "power"), [("point", 0), ("dump", 1), ("cic2", 2)])
 def test_line_above_nyquist_is_aliased_with_the_gain_of_the_filter(kind, power):
     f, rate = 730.0, 400.0
-    x = np.sqrt(2) * np.sin(2 * np.pi * f * np.arange(200_000) / vibration.FAST_HZ)
-    logged = vibration.decimate(x, rate=rate, kind=kind)[50:]
-    m = vibration.FAST_HZ / rate
+    x = np.sqrt(2) * np.sin(2 * np.pi * f * np.arange(200_000) / instrument.FAST_HZ)
+    logged = instrument.decimate(x, rate=rate, kind=kind)[50:]
+    m = instrument.FAST_HZ / rate
     factor = (
-        abs(math.sin(math.pi * f / rate) / (m * math.sin(math.pi * f / vibration.FAST_HZ))) ** power
+        abs(math.sin(math.pi * f / rate) / (m * math.sin(math.pi * f / instrument.FAST_HZ)))
+        ** power
     )
     assert logged.std() == pytest.approx(factor, rel=2e-3)
     freq, density = signal.periodogram(logged, fs=rate)
@@ -130,11 +135,11 @@ def test_line_above_nyquist_is_aliased_with_the_gain_of_the_filter(kind, power):
 
 def test_folded_density_matches_the_decimator():
     rng = np.random.default_rng(2)
-    mount = vibration.mount_filter(650.0, quality=6.0)
-    x = signal.lfilter(*mount, vibration.band_noise(rng, 800_000, low=600, high=800))
-    logged = vibration.decimate(x, rate=400.0, kind="dump")
+    mount = instrument.mount_filter(650.0, quality=6.0)
+    x = signal.lfilter(*mount, instrument.band_noise(rng, 800_000, low=600, high=800))
+    logged = instrument.decimate(x, rate=400.0, kind="dump")
     freq, measured = signal.welch(logged, fs=400.0, nperseg=256)
-    expected = 2 * vibration.folded_psd(
+    expected = 2 * instrument.folded_psd(
         freq[2:-2], rate=400.0, kind="dump", low=600, high=800, mount=mount
     )
     assert np.median(measured[2:-2] / expected) == pytest.approx(1.0, abs=0.03)
@@ -143,7 +148,7 @@ def test_folded_density_matches_the_decimator():
 
 def test_rectification_saturates():
     levels = np.array([0.1, 100.0])
-    low, high = vibration.rectify(levels, exponent=1.9, saturation=8.0)
+    low, high = instrument.rectify(levels, exponent=1.9, saturation=8.0)
     assert low == pytest.approx(0.1**1.9, rel=1e-3)
     assert high == pytest.approx(8.0**1.9, rel=0.02)
 
@@ -241,10 +246,12 @@ def test_telemetry_loses_the_given_share(share, burst):
 
 
 def test_earth_and_gravity_rotate_together():
-    angle = tool.toolface(tool.rotation(np.random.default_rng(8), 600.0, dt=0.1), dt=0.1)
-    x, y = tool.cross_axis(angle, across=9.0)
+    angle = instrument.toolface(
+        instrument.rotation(np.random.default_rng(8), 600.0, dt=0.1), dt=0.1
+    )
+    x, y = instrument.cross_axis(angle, across=9.0)
     np.testing.assert_allclose(np.hypot(x, y), 9.0)
-    gx, gy, _ = tool.gravity(angle, inclination=40.0)
+    gx, gy, _ = instrument.gravity(angle, inclination=40.0)
     np.testing.assert_allclose(gx * y, gy * x, atol=1e-9)
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.blindtest.generator import loop
+from gyrostab.blindtest.generator import instrument
 from gyrostab.blindtest.generator.detection_limits import NATS, NATS_PER_SAMPLE
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario
 from gyrostab.blindtest.generator.shapes import make_variance_effect, sample_sd
@@ -50,7 +50,7 @@ def dead_zone(scenario: Scenario, rng: np.random.Generator, *, strength: float) 
 
     def after(record: Array) -> Array:
         out = record.copy()
-        out[axis] = loop.dead_zone(
+        out[axis] = instrument.dead_zone(
             record[axis] - np.nanmean(np.where(scenario.missing, np.nan, record[axis])), width=width
         )
         return out

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.signal import lfilter
 
-from gyrostab.blindtest.generator import loop, telemetry
+from gyrostab.blindtest.generator import instrument, telemetry
 from gyrostab.blindtest.generator.detection_limits import (
     NATS,
     NATS_PER_SAMPLE,
@@ -130,14 +130,14 @@ def feedback_reset(scenario: Scenario, rng: np.random.Generator, *, strength: fl
     wander = 1 + 0.02 * np.sin(
         2 * math.pi * np.arange(scenario.size) / scenario.rate / rng.uniform(100, 900)
     )
-    phase = loop.ramp_phase(rate * wander, dt=1 / scenario.rate, first=rng.random())
+    phase = instrument.ramp_phase(rate * wander, dt=1 / scenario.rate, first=rng.random())
     settle = rng.uniform(0.03, 0.25)
     shares = np.zeros(3)
     shares[axis] = 1.0
-    resets = float(loop.reset_frequency(np.array(rate)))
+    resets = float(instrument.reset_frequency(np.array(rate)))
     return make_mean_effect(
         scenario,
-        loop.reset_error(phase, settle=settle),
+        instrument.reset_error(phase, settle=settle),
         shares,
         strength=strength,
         form=f"exponential in {settle:.2f} of the ramp, at {resets:.2f} resets a second",

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from gyrostab.blindtest.generator import telemetry, tool, vibration
+from gyrostab.blindtest.generator import instrument, telemetry
 from gyrostab.blindtest.generator.detection_limits import band_density, learned_nats
 from gyrostab.blindtest.generator.measured_noise import BANDS
 from gyrostab.blindtest.generator.noise_floor import white_level
@@ -38,7 +38,7 @@ def vibration_rectification(
     """Draw a vibration rectification: a power of the rms near 2, with saturation."""
     exponent = 2.0 if rng.random() < 0.4 else float(rng.uniform(1.6, 2.4))
     saturation = float(rng.choice([8.0, 15.0, np.inf, np.inf]))
-    shape = vibration.rectify(scenario.vibration, exponent=exponent, saturation=saturation)
+    shape = instrument.rectify(scenario.vibration, exponent=exponent, saturation=saturation)
     return make_mean_effect(
         scenario,
         to_samples(scenario, shape),
@@ -65,18 +65,18 @@ def _shake_axis(
     out = np.zeros(scenario.size)
     for begin, end in telemetry.list_spans(scenario.busy).tolist() if share else []:
         first, last = round(begin * scenario.rate), min(round(end * scenario.rate), scenario.size)
-        fast = vibration.band_noise(
+        fast = instrument.band_noise(
             rng,
-            round((last - first) * vibration.FAST_HZ / scenario.rate),
+            round((last - first) * instrument.FAST_HZ / scenario.rate),
             low=band[0],
             high=band[1],
         )
         level = np.interp(
-            np.arange(fast.size) / vibration.FAST_HZ + first / scenario.rate,
+            np.arange(fast.size) / instrument.FAST_HZ + first / scenario.rate,
             np.arange(scenario.vibration.size),
             scenario.vibration,
         )
-        logged = vibration.decimate(
+        logged = instrument.decimate(
             np.asarray(lfilter(*mount, fast * level)), rate=scenario.rate, kind=kind
         )
         out[first:last] = share * logged[: last - first]
@@ -96,7 +96,7 @@ def _make_shaking_noise(
 ) -> Effect:
     shares = draw_shares(rng, single_probability=0.4)
     f = (np.arange(BANDS) + 0.5) * scenario.rate / 2 / BANDS
-    density = vibration.folded_psd(
+    density = instrument.folded_psd(
         f, rate=scenario.rate, kind=kind, low=band[0], high=band[1], mount=mount
     )
     base = band_density(scenario)
@@ -146,7 +146,7 @@ def vibration_noise(scenario: Scenario, rng: np.random.Generator, *, strength: f
         strength=strength,
         in_band=True,
         band=(low, high),
-        mount=vibration.mount_filter(resonance, quality=quality),
+        mount=instrument.mount_filter(resonance, quality=quality),
         kind=kind,
         form=form,
     )
@@ -166,7 +166,7 @@ def aliased_vibration(scenario: Scenario, rng: np.random.Generator, *, strength:
         strength=strength,
         in_band=False,
         band=(low, high),
-        mount=vibration.mount_filter(resonance, quality=rng.uniform(3, 15)),
+        mount=instrument.mount_filter(resonance, quality=rng.uniform(3, 15)),
         kind=kind,
         form=form,
     )
@@ -176,7 +176,9 @@ def _draw_toolface(scenario: Scenario, rng: np.random.Generator) -> Array:
     """Draw the toolface at the samples [rad]."""
     return to_samples(
         scenario,
-        tool.toolface(scenario.rotation, dt=ROTATION_STEP_S, first=rng.uniform(0, 2 * math.pi)),
+        instrument.toolface(
+            scenario.rotation, dt=ROTATION_STEP_S, first=rng.uniform(0, 2 * math.pi)
+        ),
         dt=ROTATION_STEP_S,
     )
 
@@ -199,7 +201,7 @@ def _is_turning(scenario: Scenario) -> NDArray[np.bool_]:
 
 def earth_rate(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
     """Draw a residual earth rate on the cross axes; it is constant while the tool is at rest."""
-    x, y = tool.cross_axis(_draw_toolface(scenario, rng), across=1.0)
+    x, y = instrument.cross_axis(_draw_toolface(scenario, rng), across=1.0)
     effect = make_mean_effect(
         scenario,
         np.stack([x, y, np.zeros_like(x)]),
@@ -211,9 +213,9 @@ def earth_rate(scenario: Scenario, rng: np.random.Generator, *, strength: float)
     )
     assert effect.mean is not None
     across = float(np.hypot(effect.mean[0], effect.mean[1]).max())  # earth rate across the tool
-    if across < tool.EARTH_RATE:
+    if across < instrument.EARTH_RATE:
         effect.parameters["latitude"] = {
-            "value": math.degrees(math.acos(across / tool.EARTH_RATE)),
+            "value": math.degrees(math.acos(across / instrument.EARTH_RATE)),
             "unit": "deg",
         }
     return effect

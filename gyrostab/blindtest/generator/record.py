@@ -10,8 +10,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.blindtest.generator import instrument, telemetry
 from gyrostab.blindtest.generator import noise_floor as floor
-from gyrostab.blindtest.generator import telemetry, tool
 from gyrostab.blindtest.generator.environment import read_sensor
 from gyrostab.blindtest.generator.scenario import (
     AXES,
@@ -132,8 +132,8 @@ def make_channels(
     if "light_power" in needed or chance["light_power"] < 0.5:
         out["light_power"] = (1e-5 * read_sensor(rng, scenario.light, relative=0.002), 1.0)
     if chance["accel"] < 0.3:
-        angle = tool.toolface(scenario.rotation, dt=ROTATION_STEP_S, first=rng.uniform(0, 6))
-        parts = tool.gravity(angle, inclination=rng.uniform(2, 80))
+        angle = instrument.toolface(scenario.rotation, dt=ROTATION_STEP_S, first=rng.uniform(0, 6))
+        parts = instrument.gravity(angle, inclination=rng.uniform(2, 80))
         for axis, part in zip(AXES, parts, strict=True):
             out[f"accel_{axis}"] = (
                 read_sensor(rng, part, noise=0.002, dt=ROTATION_STEP_S),

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.blindtest.generator import environment, telemetry, tool
+from gyrostab.blindtest.generator import environment, instrument, telemetry
 from gyrostab.blindtest.generator.measured_noise import MeasuredNoise
 from gyrostab.blindtest.generator.noise_floor import URAD
 
@@ -190,7 +190,7 @@ def draw_scenario(
     )
     fastest = min(rng.uniform(30, 120), 60.0 * rate / 8)
     turning = (
-        tool.rotation(rng, seconds, dt=ROTATION_STEP_S, fastest=fastest)
+        instrument.rotation(rng, seconds, dt=ROTATION_STEP_S, fastest=fastest)
         if rng.random() < 0.7
         else np.zeros(math.ceil(seconds / ROTATION_STEP_S) + 1)
     )

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.blindtest.generator import coil, light
+from gyrostab.blindtest.generator import instrument
 from gyrostab.blindtest.generator.environment import lag
 from gyrostab.blindtest.generator.scenario import Effect, Scenario, to_samples
 from gyrostab.blindtest.generator.shapes import (
@@ -24,16 +24,16 @@ Array = NDArray[np.float64]
 def shupe(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
     """Draw a Shupe effect: heat conduction through the layers of a quadrupole winding."""
     layers = int(rng.choice([16, 24, 32]))
-    weights = coil.layer_weights(
+    weights = instrument.layer_weights(
         layers, trim=rng.normal(0, 3e-4), scatter=rng.normal(0, 2e-4, layers)
     )
     thickness = rng.uniform(0.004, 0.022)
     padded = np.concatenate([np.full(50, scenario.temperature[0]), scenario.temperature])
     speed = np.gradient(
-        coil.layer_temperatures(padded, dt=1.0, layers=layers, thickness=thickness), axis=1
+        instrument.layer_temperatures(padded, dt=1.0, layers=layers, thickness=thickness), axis=1
     )[:, 50:]
     shape = to_samples(scenario, weights @ speed)
-    slowest = coil.diffusion_time(thickness, 2.2e-7)
+    slowest = instrument.diffusion_time(thickness, 2.2e-7)
     form = f"diffusion through {layers} layers, slowest mode {slowest:.0f} s"
     shares = draw_shares(rng)
     effect = make_mean_effect(
@@ -157,11 +157,11 @@ def _make_light_noise(
     shares = np.abs(draw_shares(rng, single_probability=0.4))
     power = 10 ** rng.uniform(-6.0, -4.6)
     budget = {"rin": 10 ** rng.uniform(-13.5, -12.3)}
-    nominal = light.relative_psd(np.array([power]), **budget)[0]
+    nominal = instrument.relative_psd(np.array([power]), **budget)[0]
 
     def ratio(amplitude: float) -> Array:
         drop = np.clip(amplitude * shares[:, None] * loss[None, :], -20, 20)
-        return np.asarray(light.relative_psd(power * 10 ** (-drop / 10), **budget) / nominal)
+        return np.asarray(instrument.relative_psd(power * 10 ** (-drop / 10), **budget) / nominal)
 
     effect, _ = make_variance_effect(
         scenario,
@@ -178,7 +178,7 @@ def temperature_noise(scenario: Scenario, rng: np.random.Generator, *, strength:
     """Draw a noise level that follows temperature through the loss of light."""
     t = scenario.temperature
     curved = rng.random() < 0.5
-    loss = light.loss_db(
+    loss = instrument.loss_db(
         t - t.mean() + 40.0,
         np.zeros(t.size),
         per_kelvin=1.0,
@@ -198,7 +198,7 @@ def ageing_noise(scenario: Scenario, rng: np.random.Generator, *, strength: floa
     """Draw a noise level that grows with time as light is lost."""
     power = float(rng.choice([0.5, 1.0, 1.5]))
     hours = np.arange(scenario.temperature.size) / 3600.0
-    loss = light.loss_db(
+    loss = instrument.loss_db(
         np.full(hours.size, 40.0), hours, per_kelvin=0.0, per_hour=1.0, power=power
     )
     form = f"loss of light with the power {power:g} of time, detector budget"
