@@ -22,16 +22,23 @@ from gyrostab.blindtest.generator.detection_limits import (
     fitted_nats,
     shared_size,
 )
-from gyrostab.blindtest.generator.measured_noise import BANDS
+from gyrostab.blindtest.generator.noise import BANDS
 from gyrostab.blindtest.generator.record import make_record
 from gyrostab.blindtest.generator.scenario import AXES, draw_scenario, stream
 from gyrostab.blindtest.generator.wander import wander_size
-from gyrostab.blindtest.scenarios.case import make_case
-from gyrostab.blindtest.scenarios.commitment import commit_case, open_truth, truth_text
-from gyrostab.blindtest.scenarios.drivers import degrade_driver
+from gyrostab.blindtest.scenarios.case import (
+    commit_case,
+    degrade_driver,
+    make_case,
+    open_truth,
+    truth_text,
+)
 from gyrostab.blindtest.scenarios.plan import DEGRADATIONS, plan_case, plan_cases, plan_counterparts
-from gyrostab.blindtest.scoring.baseline_detectors import allan_detector, channel_detector
-from gyrostab.blindtest.scoring.visibility import MAX_SEPARATION
+from gyrostab.blindtest.scoring.baseline_detectors import (
+    MAX_SEPARATION,
+    allan_detector,
+    channel_detector,
+)
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.schema import check_log
@@ -217,7 +224,7 @@ def test_sub_threshold_cases_are_invisible_in_trace_and_allan_plot():
 
 
 def test_strong_effect_is_not_sub_threshold():
-    from gyrostab.blindtest.scoring.visibility import find_visibility
+    from gyrostab.blindtest.scoring.baseline_detectors import find_visibility
 
     scenario = white_scenario(seconds=900)
     effect = CATALOGUE["spectral_line"].make(scenario, np.random.default_rng(0), strength=30.0)

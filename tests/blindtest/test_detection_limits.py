@@ -21,7 +21,7 @@ from gyrostab.blindtest.generator.detection_limits import (
     variance_nats,
     variance_size,
 )
-from gyrostab.blindtest.generator.measured_noise import BANDS
+from gyrostab.blindtest.generator.noise import BANDS
 from gyrostab.blindtest.generator.scenario import AXES, draw_scenario, stream
 from gyrostab.blindtest.generator.shapes import fit_lagged_driver
 from gyrostab.blindtest.generator.wander import wander_size
@@ -185,7 +185,7 @@ def test_limit_of_a_mean_matches_simulated_likelihoods():
     assert white_size > 2.05  # random walk hides a slow mean: equal size needs more amplitude
     from scipy import fft
 
-    from gyrostab.blindtest.generator.noise_floor import floor_psd
+    from gyrostab.blindtest.generator.noise import floor_psd
     from gyrostab.blindtest.generator.record import draw_base_noise
 
     f = np.arange(1, scenario.size) * scenario.rate / 2 / scenario.size

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from gyrostab.blindtest.generator import electronics, instrument, telemetry
-from gyrostab.blindtest.generator import noise_floor as floor
+from gyrostab.blindtest.generator import noise as floor
 from gyrostab.blindtest.scoring.baseline_detectors import (
     allan_band,
     allan_variance,

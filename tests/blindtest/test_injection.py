@@ -17,7 +17,7 @@ from gyrostab.blindtest.generator.detection_limits import (
     shared_size,
     variance_size,
 )
-from gyrostab.blindtest.generator.measured_noise import (
+from gyrostab.blindtest.generator.noise import (
     BANDS,
     _fit_slope,
     line_density,
@@ -29,9 +29,9 @@ from gyrostab.blindtest.scenarios.case import make_case
 from gyrostab.blindtest.scenarios.injection import (
     estimate_noise,
     inject_effect,
+    plan_injections,
     quantization_step,
 )
-from gyrostab.blindtest.scenarios.real import plan_injections
 from gyrostab.schema import check_log
 from tests.support.blind_cases import small
 

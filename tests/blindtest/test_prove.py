@@ -26,10 +26,9 @@ from gyrostab.blindtest.runner.folder import (
     read_sums,
 )
 from gyrostab.blindtest.runner.outcome import _thin_out, page_text, score_rows
-from gyrostab.blindtest.runner.pool import run_in_processes
-from gyrostab.blindtest.runner.steps import diagnose_case
+from gyrostab.blindtest.runner.steps import diagnose_case, run_in_processes
+from gyrostab.blindtest.scenarios.injection import RECORDINGS
 from gyrostab.blindtest.scenarios.plan import plan_case
-from gyrostab.blindtest.scenarios.real import RECORDINGS
 from gyrostab.blindtest.scoring.table import score_table
 from gyrostab.errors import (
     FormatError,

@@ -17,7 +17,7 @@ from gyrostab.blindtest.scoring.curves import (
     names_given,
     reliability,
 )
-from gyrostab.blindtest.scoring.injections import injection_differences, injection_table
+from gyrostab.blindtest.scoring.detection import injection_differences, injection_table
 from gyrostab.blindtest.scoring.proportions import median, share, spread, wilson
 from gyrostab.blindtest.scoring.score import intersection_over_union, score_case
 from gyrostab.blindtest.scoring.table import list_missed, markdown, score_table

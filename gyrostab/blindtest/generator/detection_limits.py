@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.optimize import minimize
 
-from gyrostab.blindtest.generator.measured_noise import BANDS
-from gyrostab.blindtest.generator.noise_floor import floor_psd, white_level
+from gyrostab.blindtest.generator.noise import BANDS, floor_psd, white_level
 from gyrostab.blindtest.generator.scenario import Effect, Scenario, count_per_second
 from gyrostab.errors import OptionError
 

@@ -20,7 +20,7 @@ from gyrostab.blindtest.generator.detection_limits import (
     shared_size,
 )
 from gyrostab.blindtest.generator.environment import lag
-from gyrostab.blindtest.generator.measured_noise import BANDS
+from gyrostab.blindtest.generator.noise import BANDS
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
 from gyrostab.blindtest.generator.shapes import (
     axes_with_share,

@@ -12,8 +12,7 @@ from scipy.signal import lfilter
 
 from gyrostab.blindtest.generator import instrument, telemetry
 from gyrostab.blindtest.generator.detection_limits import band_density, learned_nats
-from gyrostab.blindtest.generator.measured_noise import BANDS
-from gyrostab.blindtest.generator.noise_floor import white_level
+from gyrostab.blindtest.generator.noise import BANDS, white_level
 from gyrostab.blindtest.generator.scenario import (
     AXES,
     ROTATION_STEP_S,

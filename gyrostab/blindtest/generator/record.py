@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.blindtest.generator import instrument, telemetry
-from gyrostab.blindtest.generator import noise_floor as floor
+from gyrostab.blindtest.generator import noise as floor
 from gyrostab.blindtest.generator.environment import read_sensor
 from gyrostab.blindtest.generator.scenario import (
     AXES,

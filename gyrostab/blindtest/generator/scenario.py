@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.blindtest.generator import environment, instrument, telemetry
-from gyrostab.blindtest.generator.measured_noise import MeasuredNoise
-from gyrostab.blindtest.generator.noise_floor import URAD
+from gyrostab.blindtest.generator.noise import URAD, MeasuredNoise
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from gyrostab.blindtest.generator.detection_limits import (
     variance_size,
 )
 from gyrostab.blindtest.generator.environment import lag
-from gyrostab.blindtest.generator.noise_floor import white_level
+from gyrostab.blindtest.generator.noise import white_level
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
 
 Array = NDArray[np.float64]

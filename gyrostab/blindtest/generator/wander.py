@@ -14,7 +14,7 @@ from gyrostab.blindtest.generator.detection_limits import (
     amplitude_for,
     learned_random_nats,
 )
-from gyrostab.blindtest.generator.noise_floor import floor_psd
+from gyrostab.blindtest.generator.noise import floor_psd
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
 from gyrostab.blindtest.generator.shapes import axes_with_share, draw_shares, make_mean_effect
 

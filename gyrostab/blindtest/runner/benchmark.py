@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import secrets
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -17,8 +17,7 @@ from gyrostab.blindtest.runner.folder import (
     read_sums,
     write_sums,
 )
-from gyrostab.blindtest.runner.pool import run_in_processes
-from gyrostab.blindtest.runner.steps import compare_case, diagnose_case, draw_case
+from gyrostab.blindtest.runner.steps import compare_case, diagnose_case, draw_case, run_in_processes
 from gyrostab.errors import OptionError, ResumeError
 from gyrostab.store.output import resolve_link
 
@@ -90,7 +89,7 @@ def prove(
         Number of processes: one per core by default, 0 to work in this process.
     real : path-like
         Folder of real recordings; one injection is made for every 20 cases. Without it there are no
-        injections. See `gyrostab.blindtest.scenarios.real`.
+        injections. See `gyrostab.blindtest.scenarios.injection`.
     resume : bool
         Continue an interrupted run in the folder, or start one.
     overwrite : bool
@@ -123,8 +122,8 @@ def prove(
     >>> print(proof.table)  # doctest: +SKIP
     """
     from gyrostab.blindtest.runner.outcome import score_rows, write_outcome
-    from gyrostab.blindtest.scenarios.commitment import open_truth
-    from gyrostab.blindtest.scenarios.real import check_recordings
+    from gyrostab.blindtest.scenarios.case import open_truth
+    from gyrostab.blindtest.scenarios.injection import check_recordings
     from gyrostab.blindtest.scoring.table import list_missed, score_table
     from gyrostab.jobs import lock_job
     from gyrostab.progress import no_stage
@@ -163,7 +162,12 @@ def prove(
         }
         baseline_scores = _compare_all(folder, truths, run_step)
         stage("counting", 0)
-        rows = score_rows(_read_diagnoses(folder, plans, failed), truths, baseline_scores)
+        diagnoses = {
+            name: json.loads((folder / "diagnoses" / f"{name}.json").read_text(encoding="utf-8"))
+            for name in plans
+            if name not in failed
+        }
+        rows = score_rows(diagnoses, truths, baseline_scores)
         table = score_table(rows)
         files = write_outcome(folder, rows, table, job=job, commitment=commitment, failed=failed)
         return Proof(job["seed"], commitment, table, list_missed(table), failed, files)
@@ -171,8 +175,8 @@ def prove(
 
 def _plan_all(job: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Plan all cases, counterparts and injections; return name -> plan."""
+    from gyrostab.blindtest.scenarios.injection import plan_injections
     from gyrostab.blindtest.scenarios.plan import plan_cases, plan_counterparts
-    from gyrostab.blindtest.scenarios.real import plan_injections
 
     drawn = plan_cases(job["cases"], seed=job["seed"])
     copies = plan_counterparts(drawn, job["counterparts"])
@@ -250,13 +254,3 @@ def _compare_all(
         for name in drawn
     ]
     return dict(zip(drawn, run_step("comparing", compare_case, jobs), strict=True))
-
-
-def _read_diagnoses(
-    folder: Path, names: Iterable[str], failed: Collection[str]
-) -> dict[str, dict[str, Any]]:
-    return {
-        name: json.loads((folder / "diagnoses" / f"{name}.json").read_text(encoding="utf-8"))
-        for name in names
-        if name not in failed
-    }

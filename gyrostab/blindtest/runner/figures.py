@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from gyrostab.plot import COLOURS, MARKERS, new_figure
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _COLUMNS = 5
 _LABELS = {
@@ -18,13 +19,11 @@ _LABELS = {
 }
 
 
-def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
+def draw_completeness(curves: pd.DataFrame) -> Figure:
     """Plot shares detected and named against strength, one panel per effect, with intervals.
 
     The first panel shows all effects.
     """
-    from gyrostab.plot import new_figure, save_png
-
     names = list(dict.fromkeys(curves["effect"])) if len(curves) else []
     down = max(1, math.ceil(len(names) / _COLUMNS))
     figure = new_figure(2.4 * _COLUMNS, 1.8 * down + 0.6)
@@ -44,12 +43,10 @@ def draw_completeness(curves: pd.DataFrame) -> Callable[[Path], None]:
             ncols=2,
             frameon=False,
         )
-    return lambda target: save_png(figure, target, colours=64)
+    return figure
 
 
 def _draw_panel(panel: Axes, part: pd.DataFrame, title: str) -> None:
-    from gyrostab.plot import COLOURS, MARKERS
-
     for number, key in enumerate(("detected", "named")):
         share = part[key].to_numpy()
         reach = [share - part[f"{key}_low"].to_numpy(), part[f"{key}_high"].to_numpy() - share]
@@ -71,10 +68,8 @@ def _draw_panel(panel: Axes, part: pd.DataFrame, title: str) -> None:
     panel.axvline(1.5, color="#8c8c8c", linewidth=0.7, linestyle=":")
 
 
-def draw_reliability(reliability: pd.DataFrame) -> Callable[[Path], None]:
+def draw_reliability(reliability: pd.DataFrame) -> Figure:
     """Plot the share of correct identifications of each name, with Wilson's interval."""
-    from gyrostab.plot import COLOURS, new_figure, save_png
-
     figure = new_figure(6.5, 1.2 + 0.26 * max(3, len(reliability)))
     panel: Any = figure.subplots()
     identifications: list[Any] = reliability.to_dict("records")
@@ -96,13 +91,11 @@ def draw_reliability(reliability: pd.DataFrame) -> Callable[[Path], None]:
     panel.set_ylim(max(len(identifications), 1) - 0.4, -0.6)
     panel.set_xlim(0, 1)
     panel.set_xlabel("share of the identifications (number)\nthat are correct, with 95 % interval")
-    return lambda target: save_png(figure, target, colours=64)
+    return figure
 
 
-def draw_calibration(curve: pd.DataFrame, risk: pd.DataFrame) -> Callable[[Path], None]:
+def draw_calibration(curve: pd.DataFrame, risk: pd.DataFrame) -> Figure:
     """Plot the share of right names against their probability, and the risk of the likeliest."""
-    from gyrostab.plot import COLOURS, MARKERS, new_figure, save_png
-
     figure = new_figure(7.0, 3.2)
     panels: Any = figure.subplots(1, 2)
     calibration, coverage = panels
@@ -139,13 +132,11 @@ def draw_calibration(curve: pd.DataFrame, risk: pd.DataFrame) -> Callable[[Path]
         xlabel="share of the records with effects\nthat have a name, most probable first",
         ylabel="share of these names\nthat are wrong",
     )
-    return lambda target: save_png(figure, target, colours=64)
+    return figure
 
 
-def draw_ranks(histogram: pd.DataFrame) -> Callable[[Path], None]:
+def draw_ranks(histogram: pd.DataFrame) -> Figure:
     """Plot how often the truth has each rank in its estimate, and the range of exact estimates."""
-    from gyrostab.plot import COLOURS, new_figure, save_png
-
     figure = new_figure(5.0, 3.0)
     panel: Any = figure.subplots()
     number = int(histogram["n"].sum())
@@ -160,16 +151,14 @@ def draw_ranks(histogram: pd.DataFrame) -> Callable[[Path], None]:
         xlabel="rank of the true parameter in its estimate",
         ylabel=f"parameters (of {number})",
     )
-    return lambda target: save_png(figure, target, colours=64)
+    return figure
 
 
-def draw_roc(curves: pd.DataFrame) -> Callable[[Path], None]:
+def draw_roc(curves: pd.DataFrame) -> Figure:
     """Plot the share of cases detected against the share of false alarms, for each detector.
 
     The axis of false alarms is logarithmic above one in a hundred, and linear below.
     """
-    from gyrostab.plot import COLOURS, MARKERS, new_figure, save_png
-
     figure = new_figure(8.0, 4.2)
     groups = list(dict.fromkeys(curves["cases"])) or [""]
     panels: Any = figure.subplots(1, len(groups), sharey=True, squeeze=False)
@@ -208,4 +197,4 @@ def draw_roc(curves: pd.DataFrame) -> Callable[[Path], None]:
             ncols=3,
             frameon=False,
         )
-    return lambda target: save_png(figure, target, colours=64)
+    return figure

@@ -31,12 +31,14 @@ from gyrostab.blindtest.scoring.curves import (
 from gyrostab.blindtest.scoring.detection import (
     counterpart_table,
     detection_shares,
+    injection_differences,
+    injection_table,
     roc_curves,
 )
-from gyrostab.blindtest.scoring.injections import injection_differences, injection_table
 from gyrostab.blindtest.scoring.probability import calibration_curve, risk_coverage
 from gyrostab.blindtest.scoring.score import drawn_rows, first_rows, score_case
 from gyrostab.blindtest.scoring.table import list_missed, markdown
+from gyrostab.plot import save_png
 from gyrostab.store.output import replace_file, write_text
 
 Rows = list[dict[str, Any]]
@@ -113,9 +115,9 @@ def write_outcome(
     targets = [folder / name for name in ("scores.csv", "table.md", *figures)]
     write_text(targets[0], pd.DataFrame(plain).to_csv(index=False))
     write_text(targets[1], page_text(rows, table, job=job, commitment=commitment, failed=failed))
-    for target, draw in zip(targets[2:], figures.values(), strict=True):
+    for target, figure in zip(targets[2:], figures.values(), strict=True):
         with replace_file(target) as temporary:
-            draw(temporary)
+            save_png(figure, temporary, colours=64)
     return targets
 
 
@@ -131,16 +133,18 @@ def page_text(
     shown = curves(rows)
     every = shown[shown["effect"] == "all"] if len(shown) else shown
     drawn = drawn_rows(rows)
+    counterparts, injections = counterpart_table(rows), injection_table(rows)
+    lines = pd.concat([lines for lines in (table, counterparts, injections) if len(lines)])
     parts = [
         _describe_run(rows, job, commitment),
         "### Headline figures",
-        markdown(_select_headlines(rows, table)),
+        markdown(lines[lines["quantity"].isin(_HEADLINES)]),
         "### Figures with 95 % intervals and targets",
         "A target is *met* where the whole interval is in the target range, *missed* where the "
         "value is not, and otherwise *not shown*: there are too few cases to decide.",
         markdown(table),
         "### Missed targets",
-        _format_list(list_missed(table), "none"),
+        _format_list(list_missed(table)),
         "### Completeness against strength",
         "Shares of all catalogue effects with an undisturbed driver; strength in units of the "
         "closed-form limit.",
@@ -171,10 +175,10 @@ def page_text(
         "### Detection at equal rates of false alarms",
         *_describe_detection(rows),
         "### Noise-only counterparts",
-        *_describe_counterparts(rows),
+        *_describe_counterparts(rows, counterparts),
         "### Wrong names",
         _format_list(
-            [_describe_wrong_name(row, drawn) for row in first_rows(drawn) if row["wrong"]], "none"
+            [_describe_wrong_name(row, drawn) for row in first_rows(drawn) if row["wrong"]]
         ),
         "### Undetected effects of strength 1.5 or more",
         _format_list(
@@ -182,15 +186,14 @@ def page_text(
                 _describe_miss(row)
                 for row in drawn
                 if row["effect"] and row["strength"] >= 1.5 and not row["detected"]
-            ],
-            "none",
+            ]
         ),
         "### Injections into real recordings",
-        *_describe_injections(rows),
+        *_describe_injections(rows, injections),
         "### Cost",
         markdown(_tabulate_cost(drawn)),
         "### Failed diagnoses",
-        _format_list([f"{name}: {reason}" for name, reason in failed.items()], "none"),
+        _format_list([f"{name}: {reason}" for name, reason in failed.items()]),
     ]
     return "\n\n".join(part if "\n" in part else _wrap_text(part) for part in parts) + "\n"
 
@@ -199,13 +202,6 @@ def _thin_out(risk: pd.DataFrame) -> pd.DataFrame:
     """Keep about ten lines of a risk-coverage curve, with the first and the last."""
     places = np.linspace(0, len(risk) - 1, min(len(risk), 10))
     return risk.iloc[places.round().astype(int)]
-
-
-def _select_headlines(rows: Sequence[Mapping[str, Any]], table: pd.DataFrame) -> pd.DataFrame:
-    """Select the main lines of all tables."""
-    tables = [table, counterpart_table(rows), injection_table(rows)]
-    lines = pd.concat([lines for lines in tables if len(lines)])
-    return lines[lines["quantity"].isin(_HEADLINES)]
 
 
 def _describe_detection(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -221,8 +217,7 @@ def _describe_detection(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
 
 
-def _describe_counterparts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    table = counterpart_table(rows)
+def _describe_counterparts(rows: Sequence[Mapping[str, Any]], table: pd.DataFrame) -> list[str]:
     if not len(table):
         return ["None in this run."]
     named = [
@@ -238,7 +233,7 @@ def _describe_counterparts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
 
 
-def _describe_injections(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _describe_injections(rows: Sequence[Mapping[str, Any]], table: pd.DataFrame) -> list[str]:
     differences = injection_differences(rows)
     if not differences:
         return [
@@ -261,7 +256,7 @@ def _describe_injections(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         "Names therefore count only if they are not found in the untouched piece. Controls are the "
         "untouched piece, and its copies reversed in sign and in time."
     )
-    return [about, markdown(injection_table(rows)), _format_list(lines, "none")]
+    return [about, markdown(table), _format_list(lines)]
 
 
 _COPY_LABELS = {
@@ -342,7 +337,7 @@ def _describe_miss(row: Mapping[str, Any]) -> str:
     return f"{_describe_case(row, [row])}; {reason}"
 
 
-def _format_list(lines: Sequence[str], none: str) -> str:
+def _format_list(lines: Sequence[str], none: str = "none") -> str:
     shown = [_wrap_text(f"- {line}", indent="  ") for line in lines[:_MAX_LISTED]] + (
         [f"- and {len(lines) - _MAX_LISTED} more, see scores.csv"]
         if len(lines) > _MAX_LISTED

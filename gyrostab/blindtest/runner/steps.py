@@ -1,4 +1,7 @@
-"""Steps of one case: draw and commit, diagnose, compare; each writes a complete file or none."""
+"""Steps of one case, in processes: draw and commit, diagnose, compare.
+
+Each writes a complete file or none.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,14 @@ from gyrostab.store.output import write_text
 
 if TYPE_CHECKING:
     import xarray as xr
+import contextlib
+import os
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
+
+from gyrostab.errors import WorkerError
+from gyrostab.jobs import open_pool, run_calls
 
 
 def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | None = None) -> str:
@@ -20,9 +31,8 @@ def draw_case(directory: Path, name: str, plan: dict[str, Any], real: Path | Non
 
     `real` is the folder of the real recordings.
     """
-    from gyrostab.blindtest.scenarios.case import make_case
-    from gyrostab.blindtest.scenarios.commitment import commit_case, fingerprint
-    from gyrostab.blindtest.scenarios.real import make_injection_case
+    from gyrostab.blindtest.scenarios.case import commit_case, fingerprint, make_case
+    from gyrostab.blindtest.scenarios.injection import make_injection_case
 
     truth = directory / "truth" / f"{name}.json"
     if truth.exists():  # written after the recording
@@ -97,3 +107,69 @@ def compare_case(recording: Path, truth: dict[str, Any], target: Path) -> dict[s
     }
     write_json(target, scores)
     return scores
+
+
+T = TypeVar("T")
+
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+def run_in_processes(
+    function: Callable[..., T],
+    jobs: Sequence[tuple[Any, ...]],
+    *,
+    workers: int | None,
+    report: Callable[[int], None] = lambda done: None,
+) -> list[T]:
+    """Call a module-level function with each of `jobs`; return the results in their order.
+
+    There are as many processes as `workers`, by default one per core, and none for 0. `report`
+    receives the number of finished jobs. If a process dies, a `WorkerError` is raised.
+
+    Examples
+    --------
+    >>> run_in_processes(divmod, [(7, 2), (9, 4)], workers=0)
+    [(3, 1), (2, 1)]
+    """
+    results: dict[int, T] = {}
+    if workers == 0 or not jobs:
+        for place, job in enumerate(jobs):
+            results[place] = function(*job)
+            report(len(results))
+        return list(results.values())
+    calls = [(_call_quietly, place, function, *job) for place, job in enumerate(jobs)]
+    with _limit_threads(), open_pool("processes", workers=workers) as pool:
+        try:
+            for (_, place, *_), result in run_calls(pool, calls):
+                results[place] = result
+                report(len(results))
+        except WorkerError as error:
+            raise WorkerError(
+                "a process that worked on a case has died, perhaps for want of memory; "
+                "continue with --resume and fewer --workers"
+            ) from error
+    return [results[place] for place in range(len(jobs))]
+
+
+@contextlib.contextmanager
+def _limit_threads() -> Iterator[None]:
+    """Limit libraries in processes started inside to one thread; they read this when loaded."""
+    previous = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    try:
+        yield
+    finally:
+        for name, value in previous.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _call_quietly(place: int, function: Callable[..., T], *arguments: Any) -> T:
+    """Call a function in one thread and without warnings; `place` numbers the call."""
+    import dask
+
+    with warnings.catch_warnings(), dask.config.set(scheduler="synchronous"):
+        warnings.simplefilter("ignore")
+        return function(*arguments)

@@ -1,4 +1,4 @@
-"""Compare detectors at equal false-alarm rates, and cases with their noise-only counterparts."""
+"""Compare detectors at equal false-alarm rates, and records with their copies without an effect."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from gyrostab.blindtest.generator.catalogue import merge_ambiguous
 from gyrostab.blindtest.scoring.proportions import make_lines, resample
 from gyrostab.blindtest.scoring.score import CATALOGUE_KINDS, answered_rows, drawn_rows, first_rows
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH
@@ -24,6 +25,9 @@ _GROUPS = {
     "catalogue": CATALOGUE_KINDS,
     "out of catalogue or degraded driver": ("out_of_catalogue", "degraded_driver"),
 }
+#: Strength in fitted noise from which most injections should be named. Amplitudes are found to
+#: 0.1 %, so that an effect drawn at this strength may be slightly weaker.
+_NAMED_STRENGTH, _STRENGTH_TOLERANCE = 5.0, 1e-3
 
 
 def _list_comparisons(
@@ -129,3 +133,72 @@ def counterpart_table(rows: Sequence[Row]) -> pd.DataFrame:
     noise = answered_rows([row for row in rows if row["kind"] in ("null", "counterpart")])
     groups = {"counterparts": mine, "noise": noise, "pairs": pairs, "names": names}
     return pd.DataFrame(make_lines("counterparts", groups))
+
+
+def injection_differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Compare the names found in the injected and reversed copies with those of the untouched one.
+
+    ``before`` are the names in the untouched copy, and ``there_before`` whether the effect's
+    ambiguity set is among them; ``named`` is whether it is named in the injected copy, ``others``
+    are other names added by the injection, and ``flipped`` and ``reversed`` names added by
+    reversing sign or time, sets merged. Injections with a control whose diagnosis failed are left
+    out.
+    """
+    groups: dict[Any, dict[str, Row]] = {}
+    for row in rows:
+        if row["kind"] == "injected" or (row["kind"] == "control" and not row.get("failed")):
+            groups.setdefault(row["index"], {})[row["copy"]] = row
+    out = []
+    for index, copies in sorted(groups.items()):
+        if set(copies) != {"injected", "untouched", "flipped", "reversed"}:
+            continue
+        names = {
+            copy: {identification["name"] for identification in row["identifications"]}
+            for copy, row in copies.items()
+        }
+        before, injected = names["untouched"], copies["injected"]
+        known, mine = (
+            set().union(*map(merge_ambiguous, before)),
+            merge_ambiguous(injected["effect"]),
+        )
+        described = ("recording", "effect", "strength", "learned_strength")
+        out.append(
+            {
+                "index": index,
+                "failed": injected.get("failed", False),
+                **{key: injected[key] for key in described},
+                "before": sorted(before),
+                "there_before": bool(before & mine),
+                "named": bool(names["injected"] & mine),
+                "others": sorted(names["injected"] - mine - known),
+                "flipped": sorted(names["flipped"] - known),
+                "reversed": sorted(names["reversed"] - known),
+            }
+        )
+    return out
+
+
+def injection_table(rows: Sequence[Row]) -> pd.DataFrame:
+    """Tabulate injections like `score_table`; empty without injections.
+
+    An effect counts as named only where the untouched copy does not have its name already.
+    """
+    differences = injection_differences(rows)
+    if not differences:
+        return pd.DataFrame(columns=["quantity", "value", "low", "high", "n", "target", "state"])
+    least = _NAMED_STRENGTH * (1.0 - _STRENGTH_TOLERANCE)
+    new = [
+        {
+            **line,
+            "is_clear": line["strength"] >= CLEAR_STRENGTH,
+            "is_strong": (line["learned_strength"] or 0.0) >= least,
+        }
+        for line in differences
+        if not line["there_before"]
+    ]
+    groups: dict[str, Sequence[Row]] = {
+        "all": differences,
+        "answered": answered_rows(differences),
+        "new": new,
+    }
+    return pd.DataFrame(make_lines("injections", groups))

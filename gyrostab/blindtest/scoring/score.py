@@ -144,9 +144,8 @@ def _tau_hit(diagnosis: Mapping[str, Any], name: str, effect: Mapping[str, Any])
     bands = [
         (m["tau_min_s"], m["tau_max_s"])
         for m in diagnosis["mismatches"]
-        if name in m.get("explained_by", ())
+        if name in m.get("explained_by", ()) and None not in (m["tau_min_s"], m["tau_max_s"])
     ]
-    bands = [band for band in bands if band[0] is not None and band[1] is not None]
     if not bands:
         return None
     return any(low <= effect["tau_max_s"] and high >= effect["tau_min_s"] for low, high in bands)
