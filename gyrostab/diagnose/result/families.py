@@ -27,7 +27,8 @@ def find_families(
 
     Lines at multiples of a spacing, counted from zero or from another line, are a family if the
     probability is below 5 % that as many unrelated lines fall there, over all spacings and centres
-    that are tried. The least probable family is taken first.
+    that are tried. The least probable family is taken first. More than three lines without a family
+    are one too.
 
     Parameters
     ----------
@@ -56,7 +57,9 @@ def find_families(
             break
         labels |= dict.fromkeys(remaining[members].tolist(), label)
         remaining = np.delete(remaining, members)
-    return [labels.get(int(place)) for place in places]
+    families = [labels.get(int(place)) for place in places]
+    is_shaped = families.count(None) > MAX_UNRELATED_LINES
+    return [family or (UNRELATED if is_shaped else None) for family in families]
 
 
 def _try_families(
@@ -99,20 +102,6 @@ def _collect_multiples(
             if any(orders):
                 spacing = float(np.dot(orders, distance[members]) / np.dot(orders, orders))
     return spacing, members
-
-
-def group_unrelated(families: Sequence[str | None]) -> list[str | None]:
-    """Make one family of the lines without a family if they are more than three.
-
-    Examples
-    --------
-    >>> group_unrelated([None, "harmonics of 10 Hz", None])
-    [None, 'harmonics of 10 Hz', None]
-    >>> group_unrelated([None] * 4)[0]
-    'lines without a common spacing'
-    """
-    is_shaped = sum(family is None for family in families) > MAX_UNRELATED_LINES
-    return [family or (UNRELATED if is_shaped else None) for family in families]
 
 
 def group_families(effects: Sequence[Mapping[str, Any]]) -> list[list[Mapping[str, Any]]]:

@@ -19,7 +19,7 @@ from gyrostab.diagnose.predict.windows import channel_units, make_windows
 from gyrostab.diagnose.reduce.block_statistics import iso
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from gyrostab.diagnose.result.diagnosis import effect_table
-from gyrostab.diagnose.result.families import find_families, group_unrelated
+from gyrostab.diagnose.result.families import find_families
 from gyrostab.diagnose.result.text import effect_statement, span_text, unsized_statement
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -157,7 +157,7 @@ def _families_of(fitted: Sequence[Fitted], blocks: xr.Dataset) -> list[str | Non
             resolution=float(np.diff(blocks["line_frequency"].values[:2])[0]),
             bandwidth=0.5 * float(blocks.attrs["sampling_rate_hz"]),
         )
-        for number, family in zip(lines, group_unrelated(labels), strict=True):
+        for number, family in zip(lines, labels, strict=True):
             families[number] = family
     return families
 
