@@ -1,17 +1,14 @@
-"""Turn identified effects into a diagnosis: fit them, measure their evidence, write all tables."""
+"""Turn identified effects into a diagnosis: fit those whose size is not zero, write all tables."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
-from itertools import compress
 from typing import Any, NamedTuple
 
-import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.diagnose.estimate.conditioned_baseline import (
     add_outlier_power,
@@ -21,15 +18,19 @@ from gyrostab.diagnose.estimate.conditioned_baseline import (
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_expected, fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, refer_to_kept_noise, with_noise
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
-from gyrostab.diagnose.identify.identification import Identifications, Selection, components_of
-from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.identify.components import axes_of, sum_evidence
+from gyrostab.diagnose.identify.identification import (
+    Identifications,
+    Rejection,
+    Selection,
+    reduce_selection,
+)
 from gyrostab.diagnose.predict.channel_use import unused_channels
-from gyrostab.diagnose.result.attribution import active_blocks, attribute_mismatches
+from gyrostab.diagnose.result.attribution import attribute_mismatches
 from gyrostab.diagnose.result.content import SCHEMA, check_diagnosis
 from gyrostab.diagnose.result.diagnosis import Diagnosis, plain
-from gyrostab.diagnose.result.held_out import held_out, select_forecast_start
+from gyrostab.diagnose.result.held_out import measure_evidence
 from gyrostab.diagnose.result.mismatch_tables import mismatch_tables
-from gyrostab.diagnose.result.size_gate import keep_supported
 from gyrostab.diagnose.result.surfaces import make_surfaces
 from gyrostab.diagnose.result.tables import (
     baseline_table,
@@ -39,9 +40,8 @@ from gyrostab.diagnose.result.tables import (
     rejected_tables,
 )
 from gyrostab.diagnose.result.verdict import decide_verdict
-from gyrostab.diagnose.settings import Settings
-from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 from gyrostab.diagnose.task import Comparison, Task, lines_without_motion
+from gyrostab.physics.registry import effects
 from gyrostab.simulate.model import Model
 
 
@@ -145,130 +145,6 @@ def refit_with_noise(
     )
 
 
-def measure_evidence(
-    blocks: xr.Dataset,
-    baseline: xr.Dataset,
-    identifications: Identifications,
-    first: Sequence[Fitted],
-) -> dict[str, float]:
-    """Measure what the effects gain on held-out data, with the noise fitted together with them.
-
-    The likelihood of `held_out` is that of means, powers and cross-spectra. Sample counts,
-    random biases and phase-locked components are in none of these: their evidence is added.
-    """
-    with_course, random_nats = _remove_random_biases(identifications)
-    judged, phase_locked_nats = remove_phase_locked(with_course, blocks)
-    identified = with_course.identified
-    count_nats = sum(
-        component.evidence_nats
-        for component in components_of(identified)
-        if component.statistic.is_count
-    )
-    clean = mask_anomalous_blocks(
-        blocks,
-        [*components_of(identified), *components_of(with_course.expected)],
-        identifications.state.settings,
-    )
-
-    def train(
-        chosen: Identifications, known: NDArray[np.bool_], is_left_out: Sequence[bool] = ()
-    ) -> xr.Dataset:
-        noise = recalibrate(chosen, baseline, first, known)
-        renewed = with_noise(chosen, noise)
-        left_out = tuple(compress(renewed.identified, is_left_out))
-        return predict_baseline(renewed, noise, known, left_out=left_out)
-
-    before = partial(expected_baseline, with_course, baseline)
-    after = partial(train, judged) if judged.identified else before
-    with_phase_locked = partial(train, with_course) if identified else before
-    settings = identifications.state.settings
-    known = select_forecast_start(blocks)
-    begun = tuple(
-        identification
-        for identification in judged.identified
-        if active_blocks(identification, blocks, settings=settings)[known].any()
-    )
-    # what is over later is not forecast, but is in the blocks that the noise is calibrated on
-    is_over = [not _can_be_forecast(identification, blocks, settings) for identification in begun]
-    has_forecast = not all(is_over)
-    evidence = held_out(
-        clean,
-        before,
-        after,
-        more_gain=count_nats + random_nats + phase_locked_nats,
-        shown=with_phase_locked if phase_locked_nats else None,
-        forecast=partial(train, replace(judged, identified=begun), is_left_out=is_over)
-        if has_forecast
-        else before,
-    )
-    if not has_forecast:
-        evidence["forecast_gain"] = np.nan  # no effect can be forecast
-    return evidence
-
-
-def _remove_random_biases(identifications: Identifications) -> tuple[Identifications, float]:
-    """Drop biases that wander or switch at random, and return their evidence [nats].
-
-    No held-out data show the course of one. Their Bayes factor is the sum of what they gain when
-    every block is predicted from those before it.
-    """
-    random_biases = [
-        identification
-        for identification in identifications.identified
-        if any(component.statistic.is_random_bias for component in identification.components)
-    ]
-    identified = tuple(
-        identification
-        for identification in identifications.identified
-        if identification not in random_biases
-    )
-    return replace(identifications, identified=identified), sum(
-        identification.evidence_nats for identification in random_biases
-    )
-
-
-def remove_phase_locked(
-    identifications: Identifications, blocks: xr.Dataset
-) -> tuple[Identifications, float]:
-    """Drop phase-locked components and slow sines, and return their held-out evidence [nats].
-
-    The band powers show how large such a component is, but not its phase. In them it would gain a
-    small part of its evidence, and lose in every band that it leaves. Therefore its own statistic
-    alone counts, and the powers of both models are without it.
-    """
-    identified, evidence_nats = [], 0.0
-    for identification in identifications.identified:
-        locked: list[Component] = []
-        rest: list[Component] = []
-        for component in identification.components:
-            is_locked = component.statistic.is_only_in_phase(component, blocks)
-            (locked if is_locked else rest).append(component)
-        evidence_nats += sum(component.evidence_nats for component in locked)
-        if rest:
-            identified.append(
-                replace(identification, components=tuple(rest)) if locked else identification
-            )
-    return replace(identifications, identified=tuple(identified)), evidence_nats
-
-
-def _can_be_forecast(identification: Selection, blocks: xr.Dataset, settings: Settings) -> bool:
-    """Return whether an effect that acts before a forecast begins can be forecast.
-
-    The size of an event in the last part is unknown before, also where it is one of several jumps,
-    and an event that is over does not affect the last part. Sample counts are in neither means nor
-    powers, which are forecast.
-    """
-    if all(component.statistic.is_count for component in identification.components):
-        return False
-    acts = active_blocks(identification, blocks, settings=settings)
-    known = select_forecast_start(blocks)
-    has_later_step = any(
-        component.is_step and (np.ptp(component.variant.design[..., known], axis=-1) == 0.0).any()
-        for component in identification.components
-    )
-    return bool(acts[~known].any() and not has_later_step)
-
-
 def _attributed_mismatches(
     task: Task, comparison: Comparison, fit: Fit, after: xr.Dataset
 ) -> list[dict[str, Any]]:
@@ -306,3 +182,91 @@ def _make_surfaces_with_outliers(
     before = add_outlier_power(before, blocks, fit.expected)
     after = add_outlier_power(after, blocks, [*fit.expected, *fit.fitted])
     return make_surfaces(blocks, before, after)
+
+
+def supported_axes(fitted: Fitted) -> tuple[str, ...]:
+    """Find the axes on which a size of the effect differs from zero.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        Effect with its sizes. A parameter ``name.axis`` belongs to one axis, any other to all.
+
+    Returns
+    -------
+    tuple of str
+        All axes when no size is measured, as for motion with another form in every band.
+    """
+    sizes = effects()[fitted.identification.effect].size_parameters
+    measured = {
+        name: estimate
+        for name, estimate in fitted.parameters.items()
+        if name.split(".")[0] in sizes
+    }
+    axes = []
+    for axis in fitted.axes:
+        axis_sizes = [
+            estimate for name, estimate in measured.items() if name.partition(".")[2] in ("", axis)
+        ]
+        # zero is not in a 95 % interval; an unknown one may contain it
+        if not axis_sizes or any(size.low > 0.0 or size.high < 0.0 for size in axis_sizes):
+            axes.append(axis)
+    return tuple(axes)
+
+
+def keep_supported(
+    identifications: Identifications, fitted: Sequence[Sequence[Fitted]]
+) -> Identifications:
+    """Keep the effects whose size differs from zero, on the axes where it does.
+
+    What an effect gained on the other axes becomes unidentified if that exceeds its threshold:
+    something is there, but the record does not show that this effect caused it.
+
+    Returns
+    -------
+    Identifications
+        `identifications` itself when every effect keeps all of its axes.
+    """
+    identified: list[Selection] = []
+    unknown: list[Selection] = []
+    rejected: list[Rejection] = []
+    for identification, numbers in zip(identifications.identified, fitted, strict=True):
+        good = {axis for fitted_effect in numbers for axis in supported_axes(fitted_effect)}
+        if set(identification.axes) <= good or not numbers:
+            identified.append(identification)
+            continue
+        supported = [
+            component for component in identification.components if set(component.row) <= good
+        ]
+        if sum_evidence(supported) > identification.threshold:
+            evidence_nats = min(identification.evidence_nats, sum_evidence(supported))
+            identified.append(reduce_selection(identification, supported, evidence_nats))
+        else:
+            supported = []
+            rejected.append(
+                Rejection(identification.effect, identification.axes, "a size of zero", math.nan)
+            )
+        lost = tuple(
+            component for component in identification.components if component not in supported
+        )
+        if sum_evidence(lost) > identification.threshold:
+            strongest = max(lost, key=lambda component: component.evidence_nats).statistic
+            unknown.append(
+                Selection(
+                    strongest.nuisance_alternative,
+                    (),
+                    axes_of(lost, identification.axes),
+                    lost,
+                    sum_evidence(lost),
+                    identification.threshold,
+                    (identification.effect,),
+                )
+            )
+    if identified == [*identifications.identified]:
+        return identifications
+    return replace(
+        identifications,
+        identified=tuple(identified),
+        unknown=(*identifications.unknown, *unknown),
+        rejected=(*identifications.rejected, *rejected),
+    )

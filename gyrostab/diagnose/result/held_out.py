@@ -3,18 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import compress
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.estimate.conditioned_baseline import (
+    expected_baseline,
+    predict_baseline,
+)
+from gyrostab.diagnose.estimate.joint_fit import Fitted
+from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks
 from gyrostab.diagnose.evidence.held_out import mean_residual, noise_weight
 from gyrostab.diagnose.evidence.products import axis_noise, mean_products
+from gyrostab.diagnose.identify.identification import Identifications, Selection, components_of
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
+from gyrostab.diagnose.result.attribution import active_blocks
+from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
+from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score
 from gyrostab.noise import NORMAL_95
 
@@ -26,14 +40,132 @@ FORECAST_FROM_SHARE = 0.7  # share of the record that a forecast begins from
 SHORT_WINDOW_BLOCKS = 5  # length of the middle one of the three windows of the Allan variance
 
 
+def measure_evidence(
+    blocks: xr.Dataset,
+    baseline: xr.Dataset,
+    identifications: Identifications,
+    first: Sequence[Fitted],
+) -> dict[str, float]:
+    """Measure what the effects gain on held-out data, with the noise fitted together with them.
+
+    The likelihood of `held_out` is that of means, powers and cross-spectra. Sample counts,
+    random biases and phase-locked components are in none of these: their evidence is added.
+    """
+    with_course, random_nats = _remove_random_biases(identifications)
+    judged, phase_locked_nats = remove_phase_locked(with_course, blocks)
+    identified = with_course.identified
+    count_nats = sum(
+        component.evidence_nats
+        for component in components_of(identified)
+        if component.statistic.is_count
+    )
+    clean = mask_anomalous_blocks(
+        blocks,
+        [*components_of(identified), *components_of(with_course.expected)],
+        identifications.state.settings,
+    )
+
+    def train(
+        chosen: Identifications, known: NDArray[np.bool_], is_left_out: Sequence[bool] = ()
+    ) -> xr.Dataset:
+        noise = recalibrate(chosen, baseline, first, known)
+        renewed = with_noise(chosen, noise)
+        left_out = tuple(compress(renewed.identified, is_left_out))
+        return predict_baseline(renewed, noise, known, left_out=left_out)
+
+    before = partial(expected_baseline, with_course, baseline)
+    after = partial(train, judged) if judged.identified else before
+    with_phase_locked = partial(train, with_course) if identified else before
+    settings = identifications.state.settings
+    known = select_forecast_start(blocks)
+    begun = tuple(
+        identification
+        for identification in judged.identified
+        if active_blocks(identification, blocks, settings=settings)[known].any()
+    )
+    # what is over later is not forecast, but is in the blocks that the noise is calibrated on
+    is_over = [not _can_be_forecast(identification, blocks, settings) for identification in begun]
+    has_forecast = not all(is_over)
+    evidence = held_out(
+        clean,
+        before,
+        after,
+        more_gain=count_nats + random_nats + phase_locked_nats,
+        shown=with_phase_locked if phase_locked_nats else after,
+        forecast=partial(train, replace(judged, identified=begun), is_left_out=is_over)
+        if has_forecast
+        else before,
+    )
+    if not has_forecast:
+        evidence["forecast_gain"] = np.nan  # no effect can be forecast
+    return evidence
+
+
+def _remove_random_biases(identifications: Identifications) -> tuple[Identifications, float]:
+    """Drop biases that wander or switch at random, and return their evidence [nats].
+
+    No held-out data show the course of one. Their Bayes factor is the sum of what they gain when
+    every block is predicted from those before it.
+    """
+    identified, evidence_nats = [], 0.0
+    for identification in identifications.identified:
+        if any(component.statistic.is_random_bias for component in identification.components):
+            evidence_nats += identification.evidence_nats
+        else:
+            identified.append(identification)
+    return replace(identifications, identified=tuple(identified)), evidence_nats
+
+
+def remove_phase_locked(
+    identifications: Identifications, blocks: xr.Dataset
+) -> tuple[Identifications, float]:
+    """Drop phase-locked components and slow sines, and return their held-out evidence [nats].
+
+    The band powers show how large such a component is, but not its phase. In them it would gain a
+    small part of its evidence, and lose in every band that it leaves. Therefore its own statistic
+    alone counts, and the powers of both models are without it.
+    """
+    identified, evidence_nats = [], 0.0
+    for identification in identifications.identified:
+        locked: list[Component] = []
+        rest: list[Component] = []
+        for component in identification.components:
+            is_locked = component.statistic.is_only_in_phase(component, blocks)
+            (locked if is_locked else rest).append(component)
+        evidence_nats += sum(component.evidence_nats for component in locked)
+        if rest:
+            identified.append(
+                replace(identification, components=tuple(rest)) if locked else identification
+            )
+    return replace(identifications, identified=tuple(identified)), evidence_nats
+
+
+def _can_be_forecast(identification: Selection, blocks: xr.Dataset, settings: Settings) -> bool:
+    """Return whether an effect that acts before a forecast begins can be forecast.
+
+    The size of an event in the last part is unknown before, also where it is one of several jumps,
+    and an event that is over does not affect the last part. Sample counts are in neither means nor
+    powers, which are forecast.
+    """
+    if all(component.statistic.is_count for component in identification.components):
+        return False
+    acts = active_blocks(identification, blocks, settings=settings)
+    known = select_forecast_start(blocks)
+    has_later_step = any(
+        component.is_step and (np.ptp(component.variant.design[..., known], axis=-1) == 0.0).any()
+        for component in identification.components
+    )
+    return bool(acts[~known].any() and not has_later_step)
+
+
 def held_out(
     blocks: xr.Dataset,
     before: FitBaseline,
     after: FitBaseline,
     *,
-    more_gain: float = 0.0,
-    shown: FitBaseline | None = None,
-    forecast: FitBaseline | None = None,
+    more_gain: float,
+    shown: FitBaseline,
+    forecast: FitBaseline,
 ) -> dict[str, float]:
     """Compare two models of a recording on data that they were not fitted to.
 
@@ -53,11 +185,10 @@ def held_out(
         Held-out gain [nats] of what is in neither means nor powers nor cross-spectra, to be added:
         sample counts, phase-locked components, random biases. Lines are in the powers of their
         bands already and would count twice.
-    shown : callable, optional
-        The same with all effects, those of `more_gain` included, for the Allan variance; `after` by
-        default.
-    forecast : callable, optional
-        The same with the effects that can be forecast; `after` by default.
+    shown : callable
+        The same with all effects, those of `more_gain` included, for the Allan variance.
+    forecast : callable
+        The same with the effects that can be forecast.
 
     Returns
     -------
@@ -67,13 +198,6 @@ def held_out(
         the mean square of the scores of the Allan variance (1 for a model that fits), and
         ``coverage95_before``, ``coverage95_after``, the share of them inside the 95 % band;
         ``forecast_gain`` [nats] on the last 30 % of models fitted to the first 70 %.
-
-    Examples
-    --------
-    >>> refit = lambda known: calibrate_noise(blocks.isel(block=known))  # doctest: +SKIP
-    >>> evidence = held_out(blocks, lambda known: baseline, refit)  # doctest: +SKIP
-    >>> evidence["log_likelihood_gain"], evidence["stderr"]  # doctest: +SKIP
-    (41.2, 6.0)
     """
     windows = cut_stretches(blocks)
     fold_of_window = np.arange(windows.first.size) % FOLDS
@@ -90,7 +214,7 @@ def held_out(
             moves |= not models["after"]["known_mean"].equals(models["before"]["known_mean"])
             if gains:
                 continue  # the Allan variance is compared on the stretches
-            if shown is not None:
+            if shown is not after:
                 models["after"] = shown(~held)
             chosen = fold_of_window == number
             inside = Windows(windows.first[chosen], windows.stop[chosen])
@@ -102,7 +226,7 @@ def held_out(
     evidence_nats, variance = max(gain.tolist() for gain in gains)
     known = select_forecast_start(blocks)
     late, early = (
-        log_likelihood(blocks, model(known), known, ~known) for model in (forecast or after, before)
+        log_likelihood(blocks, model(known), known, ~known) for model in (forecast, before)
     )
     return {
         "blocks": windows.first.size,

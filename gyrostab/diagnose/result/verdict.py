@@ -12,13 +12,9 @@ from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 
-def _read_number(held: Mapping[str, Any], name: str) -> float:
-    """Return a number of the held-out evidence, NaN for the null of JSON."""
-    return math.nan if held[name] is None else float(held[name])
-
-
 def _has_gain(held: Mapping[str, Any]) -> bool:
-    return 0.0 < _read_number(held, "log_likelihood_gain") < math.inf
+    """Return whether held-out data are predicted better; the gain may be the null of JSON."""
+    return 0.0 < (held["log_likelihood_gain"] or 0.0) < math.inf
 
 
 def failed_checks(held: Mapping[str, Any], *, settings: Settings = DEFAULTS) -> list[str]:
@@ -32,7 +28,7 @@ def failed_checks(held: Mapping[str, Any], *, settings: Settings = DEFAULTS) -> 
     ['the forecast of the last 30 % is worse (-3 nats)']
     """
     gain, forecast, before, after = (
-        _read_number(held, name)
+        math.nan if held[name] is None else float(held[name])
         for name in (
             "log_likelihood_gain",
             "forecast_gain",

@@ -22,6 +22,7 @@ def held_out(blocks, *models, **others):
     models = [model if callable(model) else lambda known, model=model: model for model in models]
     if "shown" in others:
         others["shown"] = lambda known, model=others["shown"]: model
+    others = {"more_gain": 0.0, "shown": models[1], "forecast": models[1]} | others
     return evidence.held_out(blocks, *models, **others)
 
 
