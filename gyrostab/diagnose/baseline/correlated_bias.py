@@ -38,8 +38,12 @@ from gyrostab.diagnose.evidence.wandering import (
     expected_processes,
 )
 from gyrostab.diagnose.predict.condition import fit_powers
-from gyrostab.diagnose.predict.correlated_powers import correlated_band_powers
-from gyrostab.diagnose.predict.linear_model import State, band_widths, unspread_share
+from gyrostab.diagnose.predict.linear_model import (
+    State,
+    band_widths,
+    correlated_band_powers,
+    unspread_share,
+)
 from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.kernels.regression.nonnegative import solve_nonnegative

@@ -19,13 +19,13 @@ from gyrostab.diagnose.baseline.known_lines import (
     resonance_density,
 )
 from gyrostab.diagnose.baseline.sample_transfer import undo_transfer
-from gyrostab.diagnose.predict.correlated_powers import with_correlated_powers
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import (
     average_in_bands,
     cross_without,
     moves_within_blocks,
     spread_by_gaps,
+    with_correlated_powers,
 )
 from gyrostab.diagnose.predict.windows import complex_factors, predict_effect
 from gyrostab.diagnose.reduce.block_statistics import pair_indices

@@ -17,7 +17,7 @@ from gyrostab.diagnose.predict.candidates import (
     Prospect,
     Variant,
 )
-from gyrostab.diagnose.predict.correlated_powers import with_correlated_powers
+from gyrostab.diagnose.predict.linear_model import with_correlated_powers
 from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.physics.base import Effect, driver_error
 from gyrostab.physics.prediction import Prediction, Windows

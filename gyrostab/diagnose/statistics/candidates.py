@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.evidence.sample_counts import hidden_by_grid
 from gyrostab.diagnose.predict.candidates import TIME_PARAMETER, Candidate
 from gyrostab.diagnose.predict.channel_use import MIN_BLOCK_SHARE, missing_channel_reason
-from gyrostab.diagnose.predict.correlated_powers import with_correlated_powers
 from gyrostab.diagnose.predict.filter_response import with_band_response
+from gyrostab.diagnose.predict.linear_model import with_correlated_powers
 from gyrostab.diagnose.predict.windows import (
     channel_units,
     make_windows,

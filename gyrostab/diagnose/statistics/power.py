@@ -11,11 +11,11 @@ import xarray as xr
 from gyrostab.diagnose.evidence.held_out import LinearModel, noise_columns, with_independent_cells
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
-from gyrostab.diagnose.predict.correlated_powers import is_correlated_bias
 from gyrostab.diagnose.predict.filter_response import undo_filter
 from gyrostab.diagnose.predict.linear_model import (
     State,
     band_widths,
+    is_correlated_bias,
     linear_model,
     mix_with_mean,
     power_column,

@@ -27,11 +27,12 @@ from gyrostab.diagnose.predict.candidates import (
     Prospect,
     Variant,
 )
-from gyrostab.diagnose.predict.correlated_powers import (
+from gyrostab.diagnose.predict.linear_model import (
+    State,
     correlated_band_powers,
     is_correlated_bias,
+    power_column,
 )
-from gyrostab.diagnose.predict.linear_model import State, power_column
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.statistics.base import Competitor, SizeFit, Sizes
 from gyrostab.diagnose.statistics.power import Power
