@@ -25,7 +25,6 @@ from gyrostab.diagnose.estimate.unexplained_motion import unexplained_motion
 from gyrostab.diagnose.identify.examination import prepare_examination
 from gyrostab.diagnose.identify.identification import components_of
 from gyrostab.diagnose.identify.selection import identify_effects
-from gyrostab.diagnose.inputs import check_options, read_simulation, varying_axes
 from gyrostab.diagnose.locate.mismatches import locate_mismatches
 from gyrostab.diagnose.nulls.records import repeatable_null_records
 from gyrostab.diagnose.nulls.scores import null_scores
@@ -40,8 +39,11 @@ from gyrostab.diagnose.task import (
     Comparison,
     NamedBlocks,
     Task,
+    check_options,
     lines_without_motion,
+    read_simulation,
     take_lines_at_rest,
+    varying_axes,
 )
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.convert import as_log

@@ -1,8 +1,11 @@
-"""The inputs of a diagnosis, and what the comparison of a recording with them found."""
+"""The inputs of a diagnosis with their checks, and what the comparison with them found."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import json
+import os
+import warnings
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -18,8 +21,147 @@ from gyrostab.diagnose.locate.regions import Region
 from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.reduce.moving_blocks import without_motion
 from gyrostab.diagnose.settings import Settings
+from gyrostab.errors import GyrostabError, OptionError, SchemaError
+from gyrostab.ingest.convert import as_log
+from gyrostab.ingest.uniform.cut import parse_instant
 from gyrostab.progress import Stage
-from gyrostab.simulate.model import Model
+from gyrostab.simulate.model import Model, read_model
+from gyrostab.store.toml import parse_toml
+from gyrostab.time.grid import first_stamp
+from gyrostab.wording import join_words
+
+#: Fewest null records: one of them is expected beyond the default level of 1 %.
+MIN_NULL_RECORDS = 100
+_SPAN_EXAMPLE = "2026-03-14T08:00/2026-03-14T08:30, or 0s/30min after the start"
+#: Largest power [deg^2/h] that rounding alone gives a constant rate; noise of any gyro has more.
+MAX_ROUNDING_POWER = 1e-20
+
+
+def check_options(nulls: int, level: float, seed: int) -> None:
+    """Raise `OptionError` unless these options of `gyrostab.diagnose` make sense."""
+    for name, value in (("nulls", nulls), ("seed", seed)):
+        if not isinstance(value, int | np.integer):
+            raise OptionError(f"{name}={value!r}: give a whole number")
+    if not (isinstance(level, int | float | np.number) and 0.0 < level < 0.5):
+        raise OptionError(
+            f"false_alarm_level={level!r}: give a false-alarm probability above 0 and below 0.5, "
+            "for instance 0.01"
+        )
+    if nulls < MIN_NULL_RECORDS:
+        raise OptionError(
+            f"nulls={nulls!r}: fewer than {MIN_NULL_RECORDS} null records do not determine the "
+            "false-alarm probability; give 400"
+        )
+    if seed < 0:
+        raise OptionError(f"seed={seed!r}: give a whole number from 0 up")
+
+
+def read_simulation(
+    simulation: str | os.PathLike[str] | Mapping[str, Any] | Model | xr.Dataset | None,
+    log: xr.Dataset,
+) -> Model | xr.Dataset | None:
+    """Return the simulation as a model, or as a log with the time stamps and axes of `log`.
+
+    Raises
+    ------
+    OptionError
+        When a simulated log has other time stamps or axes than the recording.
+    """
+    if isinstance(simulation, xr.Dataset):
+        simulated = as_log(simulation)
+        _check_same_stamps(log, simulated)
+        _note_effects_on_means(simulated)
+        return simulated
+    if simulation is None or isinstance(simulation, Model):
+        return simulation
+    return read_model(simulation)
+
+
+def _note_effects_on_means(simulated: xr.Dataset) -> None:
+    """Warn that the mean rate of a log that was simulated with effects is not compared."""
+    text = str(simulated.attrs.get("simulation_model", ""))  # TOML of a file, JSON of a mapping
+    try:
+        model = read_model(json.loads(text) if text.startswith("{") else parse_toml(text))
+    except (GyrostabError, ValueError, RecursionError):  # not written by this version
+        return
+    names = sorted({effect.name for effect in model.effects if effect.stage in ("motion", "rate")})
+    if names:
+        warnings.warn(
+            f"the simulated log has effects on the rate: {join_words(names)}; only noise and "
+            "steady lines of a simulated log are compared, so the diagnosis may name such an "
+            "effect again; to compare with the effects, give their model in place of the log",
+            stacklevel=2,
+        )
+
+
+def _check_same_stamps(log: xr.Dataset, simulated: xr.Dataset) -> None:
+    """Raise `OptionError` unless the two logs have the same time stamps and axes."""
+    for (quantity, expected), value in zip(
+        _describe_stamps(log).items(), _describe_stamps(simulated).values(), strict=True
+    ):
+        if value != expected:
+            raise OptionError(
+                f"the {quantity} of the simulated log is {value}, that of the recording "
+                f"{expected}; simulate on the time stamps of the recording: "
+                "gyrostab simulate MODEL.toml --like RECORDING, or give the model itself"
+            )
+
+
+def _describe_stamps(log: xr.Dataset) -> dict[str, str]:
+    return {
+        "sampling rate": f"{float(log.attrs['sampling_rate_hz']):.10g} Hz",
+        "number of samples": str(log.sizes["time"]),
+        "list of axes": ", ".join(map(str, log["axis"].values)),
+        "start": f"{np.datetime64(first_stamp(log), 'ns')}",
+    }
+
+
+def varying_axes(blocks: xr.Dataset) -> list[str]:
+    """Find the axes whose samples are not all the same, and warn of the others.
+
+    Raises
+    ------
+    SchemaError
+        When no axis varies.
+    """
+    largest_power = blocks["power"].max(["block", "band"]).values
+    axes = [str(axis) for axis in blocks["axis"].values]
+    varying = [
+        axis
+        for axis, power in zip(axes, largest_power, strict=True)
+        if not power <= MAX_ROUNDING_POWER
+    ]
+    constant = ", ".join(axis for axis in axes if axis not in varying)
+    if not varying:
+        raise SchemaError(
+            f"all samples are the same on axis {constant}: without noise there is nothing to "
+            "compare; check that the right column was read"
+        )
+    if constant:
+        warnings.warn(
+            f"all samples are the same on axis {constant}: left out of the diagnosis", stacklevel=5
+        )
+    return varying
+
+
+def parse_quiescent_span(text: str) -> tuple[float | np.datetime64, ...]:
+    """Read a quiescent stretch as written on the command line: times, or seconds after the start.
+
+    Raises
+    ------
+    OptionError
+        When it does not have two ends, or one of them is neither a time nor a duration.
+
+    Examples
+    --------
+    >>> parse_quiescent_span("0min/30min")
+    (0.0, 1800.0)
+    """
+    ends = text.split("/")
+    if len(ends) != 2:
+        raise OptionError(f"quiet {text!r}: write START/END, for instance {_SPAN_EXAMPLE}")
+    parsed = (parse_instant(end, f"quiet {text!r}:", example=_SPAN_EXAMPLE) for end in ends)
+    return tuple(np.datetime64(end, "ns") if isinstance(end, int) else end for end in parsed)
 
 
 @dataclass(frozen=True)

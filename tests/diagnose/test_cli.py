@@ -12,13 +12,13 @@ import xarray as xr
 
 import gyrostab
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.inputs import parse_quiescent_span
 from gyrostab.diagnose.nulls.scores import fit_best_evidence
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.result.attribution import join_blocks
 from gyrostab.diagnose.result.content import check_diagnosis
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic
+from gyrostab.diagnose.task import parse_quiescent_span
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import to_netcdf
@@ -290,6 +290,11 @@ def test_invalid_options_are_refused(tmp_path: Path, capfd: pytest.CaptureFixtur
 def test_unreadable_quiescent_stretches_are_refused(text: str):
     with pytest.raises(OptionError, match="quiet"):
         parse_quiescent_span(text)
+
+
+def test_quiescent_stretch_is_read_like_other_spans():
+    begin, end = parse_quiescent_span("2026-03-14T09:00+01:00/30min")
+    assert (begin, end) == (np.datetime64("2026-03-14T08:00"), 1800.0)
 
 
 # --------------------------------------------------------------------------------

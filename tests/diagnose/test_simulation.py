@@ -8,7 +8,7 @@ from functools import cache
 import pytest
 
 import gyrostab
-from gyrostab.diagnose.inputs import read_simulation
+from gyrostab.diagnose.task import read_simulation
 from gyrostab.simulate import simulate
 from tests.support.repetitions import first_of
 

@@ -134,7 +134,7 @@ def diagnose(
 
     from gyrostab.allan.plan import select_axes
     from gyrostab.diagnose.core import diagnose as run_diagnosis
-    from gyrostab.diagnose.inputs import parse_quiescent_span
+    from gyrostab.diagnose.task import parse_quiescent_span
     from gyrostab.jobs.run import load_log
     from gyrostab.report.diagnosis import find_foreign_file, write_diagnosis
     from gyrostab.store.output import check_output

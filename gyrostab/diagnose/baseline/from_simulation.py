@@ -40,7 +40,7 @@ def baseline_from_simulation(
     Its stationary statistics other than the five noise terms are taken as measured: the shape of
     its spectrum, coherency of axes, steady lines. What a simulation does to the means over time is
     indistinguishable from its random walk and therefore not known; `baseline_from_model` knows it.
-    Both have the same blocks and axes (`gyrostab.diagnose.inputs.read_simulation`).
+    Both have the same blocks and axes (`gyrostab.diagnose.task.read_simulation`).
 
     Parameters
     ----------
