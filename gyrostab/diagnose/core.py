@@ -26,8 +26,9 @@ from gyrostab.diagnose.identify.examination import prepare_examination
 from gyrostab.diagnose.identify.identification import components_of
 from gyrostab.diagnose.identify.selection import identify_effects
 from gyrostab.diagnose.locate.mismatches import locate_mismatches
+from gyrostab.diagnose.locate.regions import Region
 from gyrostab.diagnose.nulls.records import repeatable_null_records
-from gyrostab.diagnose.nulls.scores import null_scores
+from gyrostab.diagnose.nulls.scores import NullScores, null_scores
 from gyrostab.diagnose.reduce.aligned_channels import align_channels
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.moving_blocks import without_motion
@@ -36,7 +37,6 @@ from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.diagnose.result.finish import finish_diagnosis
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.task import (
-    Comparison,
     NamedBlocks,
     Task,
     check_options,
@@ -142,9 +142,9 @@ def _run_steps(task: Task, block: Any) -> Diagnosis:
     named = _identify_effects(task, *_calibrate_baseline(task, blocks))
     for revise in (_leave_out_motion, _leave_motion_out_of_lines, _take_out_fast_switching):
         named = revise(task, named) or named
-    comparison = _locate_mismatches(task, named)
+    mismatches, null = _locate_mismatches(task, named)
     task.progress("fitting", 0)
-    return finish_diagnosis(task, comparison, started)
+    return finish_diagnosis(task, named, mismatches, null, started)
 
 
 def _reduce_recording(task: Task, block: Any) -> tuple[Task, xr.Dataset]:
@@ -220,7 +220,7 @@ def _without_lines(
     return blocks, repeatable_null_records(blocks, baseline, task.nulls, task.seed)
 
 
-def _locate_mismatches(task: Task, named: NamedBlocks) -> Comparison:
+def _locate_mismatches(task: Task, named: NamedBlocks) -> tuple[list[Region], NullScores]:
     """Step 5: locate the mismatches, with the other half of the false-alarm level."""
     level = task.level / 2.0
     blocks, baseline = named.examination.start.blocks, named.baseline
@@ -236,7 +236,7 @@ def _locate_mismatches(task: Task, named: NamedBlocks) -> Comparison:
         level=level,
         settings=task.settings,
     )
-    mismatches = drop_expected(
+    unexpected = drop_expected(
         mismatches,
         expected,
         blocks,
@@ -245,7 +245,7 @@ def _locate_mismatches(task: Task, named: NamedBlocks) -> Comparison:
         level=level,
         settings=task.settings,
     )
-    return Comparison(named.blocks, baseline, mismatches, identifications, null)
+    return unexpected, null
 
 
 def _leave_out_motion(task: Task, named: NamedBlocks) -> NamedBlocks | None:

@@ -17,8 +17,6 @@ from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import Identifications
-from gyrostab.diagnose.locate.regions import Region
-from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.reduce.moving_blocks import without_motion
 from gyrostab.diagnose.settings import Settings
 from gyrostab.errors import GyrostabError, OptionError, SchemaError
@@ -189,16 +187,6 @@ class NamedBlocks(NamedTuple):
     null_records: Callable[[], Iterable[xr.Dataset]]  # the same ones on each call
     examination: Examination  # of the blocks without the lines that the baseline contains
     identifications: Identifications  # the effects that explain the differences
-
-
-class Comparison(NamedTuple):
-    """What the comparison of a recording with its baseline found."""
-
-    blocks: xr.Dataset
-    baseline: xr.Dataset  # what the simulation predicts for them
-    mismatches: list[Region]  # from `gyrostab.diagnose.locate.mismatches.locate_mismatches`
-    identifications: Identifications  # the effects that explain the differences
-    null: NullScores
 
 
 def lines_without_motion(task: Task, blocks: xr.Dataset, known: xr.Dataset) -> xr.Dataset:

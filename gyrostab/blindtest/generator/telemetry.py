@@ -38,7 +38,7 @@ def draw_losses(
 
 def list_spans(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
     """List the first index and one past the last of every run in a mask, shape (run, 2)."""
-    return np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]))).reshape(-1, 2)
+    return np.flatnonzero(np.diff(mask, prepend=False, append=False)).reshape(-1, 2)
 
 
 def limit_losses(lost: NDArray[np.bool_], *, longest: int) -> NDArray[np.bool_]:

@@ -83,9 +83,7 @@ def join_blocks(
     """
     if is_inside.mean() > 0.9:
         return [(float(begin[0]), float(end[-1]))]
-    edges = np.flatnonzero(
-        np.diff(np.concatenate([[False], is_inside, [False]]).astype(int))
-    ).reshape(-1, 2)
+    edges = np.flatnonzero(np.diff(is_inside, prepend=False, append=False)).reshape(-1, 2)
     joined: list[list[int]] = []
     for first, stop in edges.tolist():
         if joined and first - joined[-1][1] <= max(1, is_inside.size // 50):

@@ -25,6 +25,8 @@ from gyrostab.diagnose.identify.identification import (
     Selection,
     reduce_selection,
 )
+from gyrostab.diagnose.locate.regions import Region
+from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.result.attribution import attribute_mismatches
 from gyrostab.diagnose.result.content import SCHEMA, check_diagnosis
@@ -40,7 +42,7 @@ from gyrostab.diagnose.result.tables import (
     rejected_tables,
 )
 from gyrostab.diagnose.result.verdict import decide_verdict
-from gyrostab.diagnose.task import Comparison, Task, lines_without_motion
+from gyrostab.diagnose.task import NamedBlocks, Task, lines_without_motion
 from gyrostab.physics.registry import effects
 from gyrostab.simulate.model import Model
 
@@ -55,15 +57,17 @@ class Fit(NamedTuple):
     expected: list[Fitted]
 
 
-def finish_diagnosis(task: Task, comparison: Comparison, started: float) -> Diagnosis:
+def finish_diagnosis(
+    task: Task, named: NamedBlocks, located: Sequence[Region], null: NullScores, started: float
+) -> Diagnosis:
     """Fit the identified effects, measure their evidence, and attribute the mismatches."""
-    blocks, baseline = comparison.blocks, comparison.baseline
-    identifications, first, fit = fit_supported(comparison.identifications, baseline)
+    blocks, baseline = named.blocks, named.baseline
+    identifications, first, fit = fit_supported(named.identifications, baseline)
     before = expected_baseline(fit.identifications, baseline)
     after = (
         predict_baseline(fit.identifications, fit.noise) if identifications.identified else before
     )
-    mismatches = _attributed_mismatches(task, comparison, fit, after)
+    mismatches = _attributed_mismatches(task, blocks, located, null, fit, after)
     unexplained = [region["id"] for region in mismatches if not region["explained_by"]]
     held = measure_evidence(blocks, baseline, identifications, first)
     effects = effect_tables(fit.fitted, blocks, settings=task.settings)
@@ -146,11 +150,14 @@ def refit_with_noise(
 
 
 def _attributed_mismatches(
-    task: Task, comparison: Comparison, fit: Fit, after: xr.Dataset
+    task: Task,
+    blocks: xr.Dataset,
+    located: Sequence[Region],
+    null: NullScores,
+    fit: Fit,
+    after: xr.Dataset,
 ) -> list[dict[str, Any]]:
     """Return the mismatches that were located or identified, each with what explains it."""
-    blocks = comparison.blocks
-    mismatches = comparison.mismatches
     identified = fit.identifications.identified
 
     def without(left_out: Sequence[Selection]) -> xr.Dataset:
@@ -158,21 +165,21 @@ def _attributed_mismatches(
 
     lines = (
         lines_without_motion(task, blocks, after)
-        if identified and any(region["view"] == "spectrum" for region in mismatches)
+        if identified and any(region["view"] == "spectrum" for region in located)
         else None
     )
     explained = attribute_mismatches(
-        mismatches,
+        located,
         identified,
         blocks,
         after,
-        comparison.null,
+        null,
         level=task.level / 2.0,
         without=without,
         still=lines,
         settings=task.settings,
     )
-    return mismatch_tables(mismatches, explained, fit.identifications, blocks)
+    return mismatch_tables(located, explained, fit.identifications, blocks)
 
 
 def _make_surfaces_with_outliers(
