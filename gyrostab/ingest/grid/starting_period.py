@@ -186,7 +186,7 @@ def period_of_lines(parts: Parts) -> float | None:
     good = (slope > 0) & (spread < 0.95 * slope)
     if length < 12 or good.sum() < max(1, 0.03 * len(slope)):
         return None
-    # one that occurs: the mean of the two middle ones is no period if the rate changes
+    # one that occurs: if the rate changes, the mean of the two middle ones does not
     period = float(np.quantile(slope[good], 0.5, method="lower"))
     for gain in (0.5, 0.5, 0.2, 0.1, TRACK_GAIN):
         time = samples = 0
