@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -52,6 +53,15 @@ class AxisMeans(NamedTuple):
         products = marginalise(products, columns.shape[1], precision)
         return np.asarray(-0.5 * (products.square[:, 0] + products.log_determinant))
 
+    def noise_ranges(self, K: Array, B: Array) -> Array:
+        """Return the ends of the logarithms of K and B that are tried, (parameter, end).
+
+        They are those of the given values, or larger ones as far as the means scatter.
+        """
+        scatter = MAX_SCATTER * np.diff(self.values[self.present, 0]).std()
+        most = scatter * np.array([np.sqrt(HOUR / self.step), 1.0])
+        return np.log([[K.min(), max(K.max(), most[0])], [B.min(), max(B.max(), most[1])]])
+
     def with_angle_noise(
         self, K: Array, B: Array, likelihood: Array, least_nats: float
     ) -> AxisMeans:
@@ -70,38 +80,49 @@ class AxisMeans(NamedTuple):
         scatter = float(np.diff(self.values[self.present, 0]).var())
         if scatter == 0.0:
             return self
-        most = MAX_SCATTER * np.sqrt(scatter) * np.array([np.sqrt(HOUR / self.step), 1.0])
-        ends = np.log([[K.min(), max(K.max(), most[0])], [B.min(), max(B.max(), most[1])]])
+        ends = self.noise_ranges(K, B)
         start = np.log([K[likelihood.argmax()], B[likelihood.argmax()]])
-        without = self._find_peak(start, ends)
+        without = find_peaks(self._negative_likelihood, [start], ends)[0]
         # six of it are in the difference of two means
         angle = np.log(self.step**2 * scatter / 6.0)
+        starts = [np.append(slow, angle) for slow in (without.x, ends.mean(axis=1))]
         ends = np.vstack([ends, angle + np.log(_ANGLE_RANGE)])
-        with_angle = min(
-            (
-                self._find_peak(np.append(slow, angle), ends)
-                for slow in (without.x, ends[:2].mean(axis=1))
-            ),
-            key=lambda result: float(result.fun),
-        )
+        with_angle = find_peaks(self._negative_likelihood, starts, ends)[0]
         added_nats = without.fun - with_angle.fun
         return self._with_angle(with_angle.x[2]) if added_nats > least_nats else self
 
     def _with_angle(self, log_variance: float) -> AxisMeans:
         return self._replace(wander=self.wander._replace(angle=np.exp(np.array(log_variance))))
 
-    def _find_peak(self, start: Array, ends: Array) -> OptimizeResult:
-        """Find the largest likelihood of log K, log B and perhaps the log variance of the angle."""
-
-        def negative_likelihood(point: Array) -> float:
+    def _negative_likelihood(self, points: Array) -> Array:
+        """Return it for log K, log B and perhaps the log variance of the angle of every point."""
+        out = []
+        for point in points:
             means = self._with_angle(point[2]) if point.size > 2 else self
-            K, B = np.exp(point[:2])
-            return -float(means.log_likelihood(np.array([K]), np.array([B]))[0])
+            K, B = np.exp(point[:2, None])
+            out.append(-means.log_likelihood(K, B)[0])
+        return np.array(out)
 
-        return minimize(
-            negative_likelihood,
-            start,
-            method="L-BFGS-B",
-            bounds=Bounds(*ends.T),
-            options={"eps": _SHORT_STEP},
-        )
+
+def find_peaks(
+    negative_likelihood: Callable[[Array], Array], starts: Iterable[Array], ends: Array
+) -> list[OptimizeResult]:
+    """Find the largest likelihood from several starts; the best first.
+
+    Parameters
+    ----------
+    negative_likelihood : callable
+        Its value (point,) for points (point, parameter).
+    starts : iterable of ndarray, shape (parameter,)
+    ends : ndarray, shape (parameter, 2)
+        Ends of the ranges of the parameters, which are logarithms.
+    """
+    low, high = ends.T
+
+    def add_gradient(point: Array) -> tuple[float, Array]:
+        step = np.where(point + _SHORT_STEP <= high, _SHORT_STEP, -_SHORT_STEP)
+        least, *shifted = negative_likelihood(np.vstack([point, point + np.diag(step)]))
+        return float(least), (np.array(shifted) - least) / step
+
+    peaks = [minimize(add_gradient, start, jac=True, bounds=Bounds(low, high)) for start in starts]
+    return sorted(peaks, key=lambda peak: float(peak.fun))

@@ -10,7 +10,7 @@ say, because of lines or of the steep spectrum that leaks into all bands, they c
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -18,9 +18,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
-from scipy.optimize import Bounds, minimize
+from scipy.optimize import OptimizeResult
 
-from gyrostab.diagnose.baseline.axis_means import MAX_SCATTER, AxisMeans
+from gyrostab.diagnose.baseline.axis_means import AxisMeans, find_peaks
 from gyrostab.diagnose.baseline.expected_statistics import (
     common_variance,
     separate_share,
@@ -67,7 +67,6 @@ _STARTS = 7
 #: records.
 _SMALLER = 10.0
 _STEP = 0.05  # of a logarithm, for the curvature of the likelihood by differences
-_SHORT_STEP = 1e-3  # of a logarithm, for its gradient; far below any error, above rounding
 
 
 class CorrelatedBias(NamedTuple):
@@ -78,14 +77,6 @@ class CorrelatedBias(NamedTuple):
     rms: float  # degree hour-1
     time: float  # correlation time [s]
     covariance: Array  # (2, 2): of the logarithms of rms and time
-
-
-class _Peak(NamedTuple):
-    """Largest likelihood that a search found."""
-
-    point: Array  # (parameter,)
-    likelihood: float  # its logarithm
-    others: list[Array]  # where it ended from each start, (parameter,) each
 
 
 @dataclass(frozen=True)
@@ -99,10 +90,9 @@ class _AxisRecord:
     band: NDArray[np.int64]  # (cell,)
     unspread: Array  # (cell,): share of a density that gaps leave in its band
     means: AxisMeans
-    #: (parameter,): ends of the ranges of the logarithms of K [deg/h^1.5], B [deg/h], and of a
+    #: (parameter, 2): ends of the ranges of the logarithms of K [deg/h^1.5], B [deg/h], and of a
     #: bias: of its rms times the root of its time [deg/h s^0.5], and of its time [s].
-    low: Array
-    high: Array
+    ends: Array
     log_power: CubicSpline  # of a bias of unit variance (band,), by the logarithm of its time
 
     def log_likelihoods(self, points: Array) -> Array:
@@ -111,8 +101,7 @@ class _AxisRecord:
         They are the logarithms of K and B, and of a bias if there is one, (point, parameter). Q and
         N are the likeliest ones in the powers; the means have the white noise of the calibration.
         """
-        width = points.shape[1]
-        K, B, *bias = np.exp(np.clip(points, self.low[:width], self.high[:width])).T
+        K, B, *bias = np.exp(np.clip(points, *self.ends[: points.shape[1]].T)).T
         added = self.effects + np.square([B, K]).T @ self.fit.columns[:, 2:].T
         means = [self.means] * len(points)
         if bias:
@@ -154,7 +143,8 @@ class _AxisRecord:
 
     def start_grid(self) -> Array:
         """Return the values of each parameter from which a search may start, (parameter, value)."""
-        return np.linspace(self.low, self.high, _STARTS, axis=-1)
+        low, high = self.ends.T
+        return np.linspace(low, high, _STARTS, axis=-1)
 
     def _unit_powers(self, time: Array) -> Array:
         """Return the powers (time, cell) of a bias of unit variance, gaps included."""
@@ -166,39 +156,23 @@ class _AxisRecord:
 
     def find_best(self, points: Array) -> Array:
         """Return the most likely of several points, (parameter,)."""
-        return np.asarray(points[self._negative_likelihood(points).argmin()])
+        return np.asarray(points[self.negative_likelihood(points).argmin()])
 
-    def find_peak(self, starts: Iterable[Array]) -> _Peak:
-        """Find the largest likelihood from several starts."""
-        ends = np.stack([self.low, self.high])
-        searches = [
-            minimize(
-                self._likelihood_and_gradient,
-                start,
-                jac=True,
-                bounds=Bounds(*ends[:, : start.size]),
-            )
-            for start in starts
-        ]
-        best = min(searches, key=lambda result: float(result.fun))
-        return _Peak(best.x, -float(best.fun), [result.x for result in searches])
+    def find_peaks(self, starts: Sequence[Array]) -> list[OptimizeResult]:
+        """Find the largest likelihood from several starts; the best first."""
+        return find_peaks(self.negative_likelihood, starts, self.ends[: starts[0].size])
 
-    def measure_evidence(self, peak: _Peak) -> tuple[float, Array]:
+    def measure_evidence(self, peak: OptimizeResult) -> tuple[float, Array]:
         """Return the evidence by Laplace's approximation, and the covariance of the parameters."""
-        count = peak.point.size
-        precision = _measure_curvature(self._negative_likelihood, peak.point)
-        volume = float(np.log(self.high[:count] - self.low[:count]).sum())
+        count = peak.x.size
+        precision = _measure_curvature(self.negative_likelihood, peak.x)
+        volume = float(np.log(np.diff(self.ends[:count])).sum())
         width = 0.5 * (count * math.log(2.0 * math.pi) - float(np.linalg.slogdet(precision)[1]))
-        return peak.likelihood + width - volume, np.asarray(np.linalg.inv(precision))
+        return width - float(peak.fun) - volume, np.asarray(np.linalg.inv(precision))
 
-    def _negative_likelihood(self, points: Array) -> Array:
+    def negative_likelihood(self, points: Array) -> Array:
+        """Return the negative log likelihood of means and powers together, (point,)."""
         return np.asarray(-self.log_likelihoods(points).sum(axis=0))
-
-    def _likelihood_and_gradient(self, point: Array) -> tuple[float, Array]:
-        """Return the negative likelihood and its gradient by differences, within the ranges."""
-        inside = np.where(point + _SHORT_STEP <= self.high[: point.size], _SHORT_STEP, -_SHORT_STEP)
-        least, *shifted = self._negative_likelihood(np.vstack([point, point + np.diag(inside)]))
-        return float(least), (np.array(shifted) - least) / inside
 
 
 def find_correlated_bias(state: State, axis: str) -> CorrelatedBias | None:
@@ -223,20 +197,22 @@ def find_correlated_bias(state: State, axis: str) -> CorrelatedBias | None:
     if record is None:
         return None
     K, B, sizes, times = record.start_grid()
-    without = record.find_peak(record.find_best(_combine_values([k], B)) for k in K[::2])
+    without = record.find_peaks([record.find_best(_combine_values([k], B)) for k in K[::2]])
     # next to a bias, K and B are each about as large as without it, or much smaller
-    smaller = np.maximum(without.point - math.log(_SMALLER), record.low[:2])
-    noise = _combine_values(*np.column_stack([without.point, smaller]))
-    peak = record.find_peak(
-        record.find_best(_combine_values(*slow[:, None], sizes, times)) for slow in noise
+    smaller = np.maximum(without[0].x - math.log(_SMALLER), record.ends[:2, 0])
+    noise = _combine_values(*np.column_stack([without[0].x, smaller]))
+    with_bias = record.find_peaks(
+        [record.find_best(_combine_values(*slow[:, None], sizes, times)) for slow in noise]
     )
-    record = record.with_scatter_about(peak.point)
-    without, peak = (record.find_peak(before.others) for before in (without, peak))
-    evidence, covariance = record.measure_evidence(peak)
+    record = record.with_scatter_about(with_bias[0].x)
+    without, with_bias = (
+        record.find_peaks([peak.x for peak in peaks]) for peaks in (without, with_bias)
+    )
+    evidence, covariance = record.measure_evidence(with_bias[0])
     to_rms = np.array([[1.0, -0.5], [0.0, 1.0]])
     return CorrelatedBias(
-        evidence - record.measure_evidence(without)[0],
-        *_rms_and_time(peak),
+        evidence - record.measure_evidence(without[0])[0],
+        *_rms_and_time(with_bias[0]),
         to_rms @ covariance[-2:, -2:] @ to_rms.T,
     )
 
@@ -249,16 +225,16 @@ def fit_rms(state: State, axis: str, time: float) -> float | None:
     record = _axis_record(state, axis)
     if record is None:
         return None
-    low, high = (np.append(ends[:-1], math.log(time)) for ends in (record.low, record.high))
-    record = replace(record, low=low, high=high)
+    log_time = math.log(time)
+    record = replace(record, ends=np.vstack([record.ends[:-1], [log_time, log_time]]))
     K, B, sizes, _ = record.start_grid()
-    peak = record.find_peak([record.find_best(_combine_values(K[::2], B[::2], sizes, low[-1:]))])
-    peak = record.with_scatter_about(peak.point).find_peak(peak.others)
-    return _rms_and_time(peak)[0]
+    start = record.find_best(_combine_values(K[::2], B[::2], sizes, [log_time]))
+    point = record.find_peaks([start])[0].x
+    return _rms_and_time(record.with_scatter_about(point).find_peaks([point])[0])[0]
 
 
-def _rms_and_time(peak: _Peak) -> tuple[float, float]:
-    size, log_time = peak.point[-2:]
+def _rms_and_time(peak: OptimizeResult) -> tuple[float, float]:
+    size, log_time = peak.x[-2:]
     return math.exp(size - 0.5 * log_time), math.exp(log_time)
 
 
@@ -304,34 +280,6 @@ def _find_free_bands(state: State, axis: str) -> NDArray[np.bool_]:
     return out
 
 
-def _find_ranges(
-    means: Array, density: float, variance: Array, block: float
-) -> tuple[Array, Array]:
-    """Return the ends of the ranges of all parameters, `low` and `high` of `_AxisRecord`.
-
-    Parameters
-    ----------
-    means, variance : ndarray, shape (block,)
-        Block means [degree hour-1], and their white variance.
-    density : float
-        Of the white noise in the powers [degree2 hour-2 Hz-1].
-    block : float
-        Length of a block [s].
-    """
-    span = means.size * block
-    K, B = fine_grid(density, span, block)
-    scatter = MAX_SCATTER * float(np.nanstd(np.diff(means[np.isfinite(means)])))
-    sizes = np.sqrt(block * float(np.nanmedian(variance)) * _DENSITY_RATIOS / 2.0)
-    ranges = [
-        (K[0], max(K[-1], scatter * math.sqrt(HOUR / block))),
-        (B[0], max(B[-1], scatter)),
-        (sizes[0], sizes[1]),
-        (0.5 * block, span / 4.0),
-    ]
-    low, high = np.log(np.array(ranges)).T
-    return low, high
-
-
 def _axis_record(state: State, axis: str) -> _AxisRecord | None:
     """Collect the means and powers of an axis, averaged over blocks of similar power."""
     blocks, baseline, row = state.blocks, state.baseline, state.axes.index(axis)
@@ -367,12 +315,24 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
     weight = weight * separate_share(shape[chosen], shape_alone[chosen], common[chosen])
     fit = Fit(mean, columns[:, :4], weight)
     square, _, _ = fit_squares(fit)
-    block, variance = float(blocks.attrs["block_s"]), axis_values(baseline, "mean_variance", axis)
     square[1] = max(float(square[1]), floor_square(fit))
-    low, high = _find_ranges(values[:, 0], HOUR * float(square[1]), variance, block)
-    if high[-1] <= low[-1] + math.log(2.0):
+    block, variance = float(blocks.attrs["block_s"]), axis_values(baseline, "mean_variance", axis)
+    means = AxisMeans(
+        np.where(present[:, None], values, 0.0),
+        state.given_to("mean", axis),
+        variance,
+        block,
+        present,
+        expected_processes(baseline, axis),
+    )
+    span = len(values) * block
+    times = np.array([0.5 * block, span / 4.0])
+    if times[1] <= 2.0 * times[0]:
         return None
-    log_times = np.linspace(low[-1], high[-1], _TIMES)
+    sizes = np.sqrt(block * float(np.nanmedian(variance)) * _DENSITY_RATIOS / 2.0)
+    slow_noise = means.noise_ranges(*fine_grid(HOUR * float(square[1]), span, block))
+    ends = np.vstack([slow_noise, np.log([sizes, times])])
+    log_times = np.linspace(ends[-1, 0], ends[-1, 1], _TIMES)
     powers = state.recall(
         lambda: [correlated_band_powers(blocks, float(time)) for time in np.exp(log_times)],
         b"powers of correlated biases",
@@ -384,15 +344,7 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
         columns[:, 6],
         np.rint(columns[:, 4]).astype(np.int64),
         columns[:, 5],
-        AxisMeans(
-            np.where(present[:, None], values, 0.0),
-            state.given_to("mean", axis),
-            variance,
-            block,
-            present,
-            expected_processes(baseline, axis),
-        ),
-        low,
-        high,
+        means,
+        ends,
         CubicSpline(log_times, np.log(powers)),
     )
