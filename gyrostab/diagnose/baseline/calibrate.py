@@ -35,7 +35,7 @@ from gyrostab.diagnose.baseline.posterior import (
 from gyrostab.diagnose.baseline.quiescent import (
     find_quiescent_blocks,
     find_quiescent_spans,
-    noise_level_excess,
+    significant_level,
 )
 from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables, weighted_mean
@@ -69,10 +69,7 @@ def _mean_noise_excess(
         power, shape, spectrum = power[:, explained], shape[:, explained], spectrum[:, explained]
     count = np.nan_to_num(shape).sum(axis=0) / max(1, int(np.isfinite(shape).all(axis=1).sum()))
     low = max(2, int(np.searchsorted(np.cumsum(count), _MIN_LOW_SHAPE)) + 1)
-    level, deviation = noise_level_excess(
-        power[:, :low] / spectrum[:, :low] - 1.0, shape[:, :low], settings=settings
-    )
-    return np.asarray(np.where(deviation > settings.excess_sigma, level, 1.0))
+    return significant_level(power[:, :low] / spectrum[:, :low] - 1.0, shape[:, :low], settings)
 
 
 def grid_values(term: str, centre: float, scale: float, *, more: int = 0) -> Array:

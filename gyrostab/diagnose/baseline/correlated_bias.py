@@ -27,7 +27,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
 )
 from gyrostab.diagnose.baseline.posterior import (
     Fit,
-    average_blocks,
+    average_groups,
     fine_grid,
     fit_squares,
     floor_square,
@@ -302,18 +302,18 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
         ],
         axis=-1,
     )
-    order = np.argsort(np.where(chosen, state.weight[row].mean(axis=1), np.inf), kind="stable")
     varies = np.ptp(known[chosen], axis=0).max() > _MIN_CHANGE * np.nanmin(power[chosen])
-    count = min(_LEVEL_GROUPS, int(chosen.sum())) if varies else 1
-    groups = np.array_split(order[: int(chosen.sum())], count)
-    cells = np.nan_to_num(cells)
-    fits = [average_blocks(power[group], shape[group], cells[group]) for group in groups]
-    mean, columns, weight = (
-        np.concatenate([getattr(fit, name) for fit in fits])
-        for name in ("power", "columns", "weight")
+    fit = average_groups(
+        power,
+        shape,
+        np.nan_to_num(cells),
+        state.weight[row].mean(axis=1),
+        chosen,
+        _LEVEL_GROUPS if varies else 1,
     )
-    weight = weight * separate_share(shape[chosen], shape_alone[chosen], common[chosen])
-    fit = Fit(mean, columns[:, :4], weight)
+    share = separate_share(shape[chosen], shape_alone[chosen], common[chosen])
+    columns = fit.columns
+    fit = Fit(fit.power, columns[:, :4], fit.weight * share)
     square, _, _ = fit_squares(fit)
     square[1] = max(float(square[1]), floor_square(fit))
     block, variance = float(blocks.attrs["block_s"]), axis_values(baseline, "mean_variance", axis)

@@ -17,7 +17,7 @@ from gyrostab.diagnose.baseline.quiescent import (
     find_quiescent_blocks,
     find_quiescent_spans,
     given_quiescent_blocks,
-    noise_level_excess,
+    significant_level,
 )
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_evidence, line_skirt
 from gyrostab.diagnose.predict.linear_model import average_in_bands, unspread_share
@@ -101,10 +101,12 @@ def _calibrate_simulation(
         )
         posteriors = calibrate_axes(explained, chosen, settings)
         plain = sum_noise(columns, [posterior.square for posterior in posteriors])
-        level = _level_over_time(explained, plain, settings)
-        expected = plain * level[..., None]
+        ratio, shape = explained["power"].values / plain, explained["shape"].values
+        level = np.array(
+            [significant_level(*axis, settings) for axis in zip(ratio - 1.0, shape, strict=True)]
+        )
         form, shape = weighted_mean(
-            explained["power"].values / expected, explained["shape"].values, axis=1
+            explained["power"].values / (plain * level[..., None]), shape, axis=1
         )
         off = np.abs(form - 1.0) * np.sqrt(shape)
         is_worst = (off > settings.excess_sigma) & (off == off.max(axis=1, keepdims=True))
@@ -113,18 +115,6 @@ def _calibrate_simulation(
         if not newly_unexplained.any():
             return posteriors, level, unexplained
         unexplained |= newly_unexplained
-
-
-def _level_over_time(simulated: xr.Dataset, plain: Array, settings: Settings) -> Array:
-    """Return the noise level of every block (axis, block); 1 if not significant."""
-    power, shape = (simulated[name].values for name in ("power", "shape"))
-    level = np.ones(plain.shape[:2])
-    for row in range(len(plain)):
-        risen, deviation = noise_level_excess(
-            power[row] / plain[row] - 1.0, shape[row], settings=settings
-        )
-        level[row] = np.where(deviation > settings.excess_sigma, risen, 1.0)
-    return level
 
 
 def _shared_statistics(

@@ -81,6 +81,21 @@ def average_blocks(power: Array, shape: Array, columns: Array) -> Fit:
     return Fit(mean[has_data], mean_columns[has_data], total[has_data])
 
 
+def average_groups(
+    power: Array,
+    shape: Array,
+    columns: Array,
+    level: Array,
+    chosen: NDArray[np.bool_],
+    count: int,
+) -> Fit:
+    """Average the chosen blocks in at most so many groups of similar level (block,)."""
+    order = np.argsort(np.where(chosen, level, np.inf), kind="stable")[: int(chosen.sum())]
+    groups = np.array_split(order, min(count, order.size))
+    fits = [average_blocks(power[group], shape[group], columns[group])[:3] for group in groups]
+    return Fit(*map(np.concatenate, zip(*fits, strict=True)))
+
+
 def fit_squares(fit: Fit) -> tuple[Array, Array, Array]:
     """Fit non-negative squares by gamma likelihood (Whittle).
 

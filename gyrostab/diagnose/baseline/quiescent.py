@@ -107,6 +107,12 @@ def noise_level_excess(
     return level, deviation
 
 
+def significant_level(residual: Array, weight: Array, settings: Settings) -> Array:
+    """Return the noise level (block,) of `noise_level_excess`; 1 if not significant."""
+    level, deviation = noise_level_excess(residual, weight, settings=settings)
+    return np.where(deviation > settings.excess_sigma, level, 1.0)
+
+
 def _typical_spectrum(power: Array, shape: Array) -> Array | None:
     """Return the spectrum (band,) of the block with the median level, or None without data."""
     mean, total = weighted_mean(power, shape)

@@ -25,7 +25,7 @@ from gyrostab.diagnose.baseline.known_effects import random_means
 from gyrostab.diagnose.baseline.posterior import (
     Fit,
     Posterior,
-    average_blocks,
+    average_groups,
     fit_squares,
     floor_square,
     noise_posterior,
@@ -310,7 +310,7 @@ def _fit_noise(
     separate = block_shape / (1.0 + common * block_shape)
     share = np.minimum(separate / np.maximum(np.nansum(shape, axis=1), 1e-300), 1.0)
     reduced = shape * share[:, None]
-    fit = _average_groups(power, reduced, columns, state.weight[row], axis_effects, chosen)
+    fit = _average_powers(power, reduced, columns, state.weight[row], axis_effects, chosen)
     square, information, _ = fit_squares(fit)
     assert fit.start is not None
     plain = float((fit.weight / np.square(fit.start) * fit.columns[:, 1] ** 2).sum())
@@ -325,7 +325,7 @@ def _fit_noise(
     return noise_posterior(fit, blocks, row, variance, chosen, effect_means, state.settings, wander)
 
 
-def _average_groups(
+def _average_powers(
     power: Array,
     shape: Array,
     columns: Array,
@@ -334,26 +334,19 @@ def _average_groups(
     chosen: NDArray[np.bool_],
 ) -> Fit:
     """Average the powers over blocks of similar level."""
-    level = np.where(chosen, np.log(expected.mean(axis=1)), np.inf)
-    groups = np.array_split(
-        np.argsort(level, kind="stable")[: int(chosen.sum())], min(LEVEL_GROUPS, int(chosen.sum()))
-    )
     free_columns = [
         column / max(float(np.abs(column).max()), 1e-300) for column in axis_effects.free
     ]
     effect_columns = np.stack([axis_effects.known, expected, *free_columns], axis=-1)
     cells = np.nan_to_num(np.concatenate([columns, effect_columns], axis=-1))
-    fits = [average_blocks(power[group], shape[group], cells[group]) for group in groups]
-    mean, means, weight = (
-        np.concatenate([getattr(fit, name) for fit in fits])
-        for name in ("power", "columns", "weight")
-    )
-    columns, known, start, free = means[:, :4], means[:, 4], means[:, 5], means[:, 6:]
+    level = np.log(expected.mean(axis=1))
+    fit = average_groups(power, shape, cells, level, chosen, LEVEL_GROUPS)
+    columns, (known, start), free = fit.columns[:, :4], fit.columns[:, 4:6].T, fit.columns[:, 6:]
     precision = np.zeros(free.shape[1])
     if np.any(known > 0.0):  # the predicted power has an error too
         free = np.concatenate([free, known[:, None]], axis=1)
         precision = np.append(precision, 1.0 / axis_effects.doubt**2)
-    return Fit(mean, columns, weight, known, free, precision, start)
+    return Fit(fit.power, columns, fit.weight, known, free, precision, start)
 
 
 def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identifications:

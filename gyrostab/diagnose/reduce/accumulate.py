@@ -154,17 +154,17 @@ class Accumulator:
                 turns, np.logical_or.reduce(present[:axes])
             )
         if self.ramp is not None:
-            profile = np.zeros((2, axes, count, RAMP_PHASE_BINS))
-            sums, numbers = profile[0], profile[1].astype(np.int64)
+            sums = np.zeros((axes, count, RAMP_PHASE_BINS))
+            numbers = np.zeros(sums.shape, np.int64)
             for row in range(axes):
                 kernel.phase_profile(
                     centred[row], present[row], values[self.ramp], *self.ramp_range,
                     sums[row], numbers[row],
                 )  # fmt: skip
             with np.errstate(invalid="ignore"):
-                profile_mean = sums / numbers
+                sums /= numbers
             by_name |= {
-                "profile": profile_mean,
+                "profile": sums,
                 "profile_samples": numbers,
                 "ramp_turns": self._measure_ramp_turns(values[self.ramp])[None],
             }

@@ -266,12 +266,9 @@ def interpolate_linearly(
     instants: Stamps, stamps: Stamps, values: Array, reach: float, *, hold_previous: bool
 ) -> Array:
     """Interpolate linearly, or hold the previous value; NaN across gaps longer than reach."""
-    following = np.searchsorted(stamps, instants, side="left")
-    inside = (following < stamps.size) & (
-        (following > 0) | (stamps[np.minimum(following, stamps.size - 1)] == instants)
-    )
-    high = np.clip(following, 0, stamps.size - 1)
+    high = np.minimum(np.searchsorted(stamps, instants), stamps.size - 1)
     low = np.where(stamps[high] == instants, high, np.maximum(high - 1, 0))
+    inside = (stamps[low] <= instants) & (instants <= stamps[high])
     within_reach = inside & (stamps[high] - stamps[low] <= reach)
     share = (instants - stamps[low]) / np.maximum(stamps[high] - stamps[low], 1)
     line = values[low] + (0.0 if hold_previous else share) * (values[high] - values[low])

@@ -47,20 +47,16 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     peaks, outliers = count_outliers(by_name["histogram"], work.peaks)
     subset, at_once = np.array(list(work.at_once), np.bool_), np.stack(list(work.at_once.values()))
     filled = zeros_beyond_chance(by_name["common_zeros"], counts[..., 1], present, subset, at_once)
-    first_values = [_kept_values(work, row, _STEP_VALUES_PER_BLOCK) for row in range(work.axes)]
-    steps = np.array([quantization_step(values) for values in first_values])
+    samples = np.stack(work.kept_samples, axis=1)  # (axis, block, sample)
+    steps = np.array(
+        [quantization_step(first.ravel()) for first in samples[..., :_STEP_VALUES_PER_BLOCK]]
+    )
     # on a quantization grid equal values are frequent by chance
     resent = np.where(steps[:, None, None] > 0.0, 0, by_name["resent"])
-    widths = np.array([bin_widths(_kept_values(work, row), step) for row, step in enumerate(steps)])
-    centres, per_repeat = np.transpose(
-        [sticking_value(_kept_values(work, row), step) for row, step in enumerate(steps)]
-    )
-    zones = np.array(
-        [
-            empty_zone(_kept_values(work, row) - centre)
-            for row, centre in enumerate(np.nan_to_num(centres))
-        ]
-    )
+    samples = samples.reshape(work.axes, -1)
+    widths = np.array([*map(bin_widths, samples, steps)])
+    centres, per_repeat = np.transpose([*map(sticking_value, samples, steps)])
+    zones = np.array([*map(empty_zone, samples - np.nan_to_num(centres)[:, None])])
     lowest, highest = _record_range(moments)
     at_ends = _count_at_range_ends(moments, counts[..., 3:5])
     # held samples; those at zero or at an end of the range have another cause
@@ -108,7 +104,9 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     if work.rotation is not None:
         with np.errstate(invalid="ignore", divide="ignore"):
             arrays["turn_line_power"] = work.turn_line_sum / (work.turn_line_expected * work.rate)
-    arrays |= work.sines.strongest(_line_frequencies(work)) | _gap_table(work, log, restart)
+    coordinates = _make_coordinates(work, log)
+    frequencies = coordinates["line_frequency"][1]
+    arrays |= work.sines.strongest(frequencies) | _gap_table(work, log, restart)
     variables = (
         label_variables(arrays)
         | _cross_spectra(work, by_name, log)
@@ -119,12 +117,7 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         variables |= label_variables({"ramp_turns": by_name["ramp_turns"][0]})
         variables["ramp_turns"][2].update(zip(("low", "high"), work.ramp_range, strict=True))
     attrs = _make_attributes(work, log, present) | {"restart_gap_s": restart}
-    return xr.Dataset(variables, coords=_make_coordinates(work, log), attrs=attrs)
-
-
-def _kept_values(work: Accumulator, row: int, max_per_block: int | None = None) -> Array:
-    """Return the kept samples of an axis, up to `max_per_block` of each block."""
-    return np.concatenate([samples[row][:max_per_block] for samples in work.kept_samples])
+    return xr.Dataset(variables, coords=coordinates, attrs=attrs)
 
 
 def _equal_block_share(
@@ -277,10 +270,6 @@ def _gap_table(work: Accumulator, log: xr.Dataset, restart: float) -> dict[str, 
     }
 
 
-def _line_frequencies(work: Accumulator) -> Array:
-    return np.asarray(np.arange(1, work.line_sum.shape[-1] + 1) * (work.rate / work.length))
-
-
 def _make_coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     ends = np.arange(work.block_count + 1) * work.length
     stamps = grid_times(work.start, work.rate, ends)
@@ -298,7 +287,7 @@ def _make_coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
         "frequency": (work.edges[:-1] + work.edges[1:] - 1) / 2.0 * step,
         "band_low": (work.edges[:-1] - 0.5) * step,
         "band_high": (work.edges[1:] - 0.5) * step,
-        "line_frequency": _line_frequencies(work),
+        "line_frequency": np.arange(1, work.line_sum.shape[-1] + 1) * step,
     }
     if work.channels:
         arrays["reference"] = np.array(work.channels, dtype=object)
