@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
+import xarray as xr
 
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import group_components
 from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component
-from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.condition import condition_on
+from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
+from gyrostab.diagnose.statistics.candidates import effect_candidates
 
 
 def select_candidate(candidates: Iterable[Candidate], effect: str, statistic: str) -> Candidate:
@@ -52,3 +55,33 @@ def make_identifications(
     return Identifications(
         tuple(identified), (), 8.0, np.zeros(1), dict(reasons or {}), tuple(candidates), state
     )  # type: ignore[arg-type]
+
+
+def identify_by_hand(
+    blocks: xr.Dataset,
+    baseline: xr.Dataset,
+    effect: str,
+    statistic: str,
+    columns: tuple[str, ...],
+    *,
+    axis: str = "x",
+    **values: float,
+) -> Identifications:
+    """Return the identification of one effect on an axis, or on x and y if it belongs to the pair.
+
+    The variant is the one nearest to the given values of its parameters.
+    """
+    candidates, reasons = effect_candidates(blocks, baseline["coefficient"])
+    candidate = select_candidate(candidates, effect, statistic)
+    variant = min(
+        (variant for variant in candidate.variants if variant.columns == columns),
+        key=lambda variant: sum(
+            abs(1.0 / (1.0 + variant.values[name]) - 1.0 / (1.0 + size))
+            for name, size in values.items()
+        ),
+    )
+    row = ("x", "y") if statistic == "cross_spectrum" else (axis,)
+    component = Component(candidate, variant, row, 500.0)
+    identification = Selection(effect, candidate.driver, row, (component,), 500.0, 8.0)
+    state = condition_on(initial_state(blocks, baseline), [component])
+    return make_identifications([identification], state, candidates, reasons)

@@ -79,7 +79,7 @@ def test_null_records_have_the_peaks_of_the_model():
     made = model(0.5, quality=30.0)
     blocks = reduce_log(simulate(made, duration="1h", rate=10.0, seed=2).compute())
     baseline = baseline_from_model(blocks, made)
-    nulls = next(iter(null_records(blocks, baseline, count=25, rng=np.random.default_rng(1))))
+    nulls = next(null_records(blocks, baseline, count=25, rng=np.random.default_rng(1)))
     drawn = nulls["line_power"].isel(axis=0).mean(["record", "part"])
     recorded = blocks["line_power"].isel(axis=0).mean("part")
     is_near_line = np.abs(blocks["line_frequency"].values - PLACE) < 0.1

@@ -10,12 +10,11 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.nulls.records import null_records
-from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
-from tests.diagnose.estimate.test_joint_fit import identify_by_hand
+from tests.diagnose.estimate import test_joint_fit as joint_fit
+from tests.support.candidates import identify_by_hand
 from tests.support.named import WORLD, record
 
 RECORDS, SECONDS, BLOCK = 20, 3600, 20
@@ -42,23 +41,12 @@ def fit_records(
 ) -> list[dict[str, Any]]:
     """Fit an effect to records of noise with its mean, given once per second."""
     blocks = record([], environment=environment)
-    baseline = calibrate_noise(blocks)
-    frame = identify_by_hand(blocks, baseline, effect, "mean", (column,))
-    drawn = next(
-        iter(
-            null_records(
-                blocks, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS
-            )
-        )
-    )
-    out = []
-    for number in range(RECORDS):
-        mean = drawn["mean"].isel(record=number).transpose("axis", "block") + average_blocks(shape)
-        state = condition_on(
-            initial_state(blocks.assign(mean=mean), baseline), list(frame.identified[0].components)
-        )
-        out.append(dict(fit_identifications(replace(frame, state=state), baseline)[0].parameters))
-    return out
+
+    def change(drawn: xr.Dataset) -> xr.Dataset:
+        return drawn.assign(mean=drawn["mean"] + average_blocks(shape))
+
+    noise = blocks, calibrate_noise(blocks)
+    return [*joint_fit.fit_records(noise, change, effect, "mean", (column,), RECORDS)]
 
 
 def covered_share(estimates: list[dict[str, Any]], name: str, truth: float) -> float:
@@ -143,13 +131,8 @@ def test_limit_of_an_effect_slower_than_the_grid():
             candidate for candidate in frame.candidates if candidate.effect == "shupe"
         ),
     )
-    drawn = next(
-        iter(
-            null_records(
-                blocks, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS
-            )
-        )
-    )
+    rng = np.random.default_rng(8)
+    drawn = next(null_records(blocks, baseline, count=RECORDS, rng=rng, chunk=RECORDS))
     means = average_blocks(size * filter_slowly(60.0 * np.gradient(heat), time))
     limits = []
     for number in range(RECORDS):

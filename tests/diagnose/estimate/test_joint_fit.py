@@ -15,7 +15,7 @@ from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.joint_fit import _make_estimate, fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
-from gyrostab.diagnose.identify.identification import Identifications, Selection
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
@@ -24,8 +24,8 @@ from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.diagnose.statistics.spectral_line import estimate_line, line_quality
 from gyrostab.simulate import simulate
-from tests.support.candidates import make_identifications, select_candidate
-from tests.support.named import COEFFICIENT, record
+from tests.support.candidates import identify_by_hand, make_identifications, select_candidate
+from tests.support.named import record
 
 RECORDS = 60
 
@@ -36,38 +36,13 @@ def noise_only():
     return blocks, calibrate_noise(blocks)
 
 
-def identify_by_hand(
-    blocks: xr.Dataset,
-    baseline: xr.Dataset,
-    effect: str,
-    statistic: str,
-    columns: tuple[str, ...],
-    *,
-    axis: str = "x",
-) -> Identifications:
-    """Return the identification of one effect on one axis."""
-    candidates, reasons = effect_candidates(blocks, COEFFICIENT)
-    candidate = select_candidate(candidates, effect, statistic)
-    variant = next(variant for variant in candidate.variants if variant.columns == columns)
-    component = Component(candidate, variant, (axis,), 50.0)
-    identification = Selection(effect, candidate.driver, (axis,), (component,), 50.0, 8.0)
-    state = condition_on(initial_state(blocks, baseline), [component])
-    return make_identifications([identification], state, candidates, reasons)
-
-
-def fit_records(noise_only, change, effect, statistic, columns):
-    """Fit many records of noise to which `change` adds an effect."""
-    blocks, baseline = noise_only
-    drawn = next(
-        iter(
-            null_records(
-                blocks, baseline, count=RECORDS, rng=np.random.default_rng(8), chunk=RECORDS
-            )
-        )
-    )
-    out = []
+def fit_records(noise, change, effect, statistic, columns, count=RECORDS):
+    """Fit many records of noise to which `change` adds an effect; yield the parameters of each."""
+    blocks, baseline = noise
+    rng = np.random.default_rng(8)
+    drawn = next(null_records(blocks, baseline, count=count, rng=rng, chunk=count))
     frame = identify_by_hand(blocks, baseline, effect, statistic, columns)
-    for number in range(RECORDS):
+    for number in range(count):
         record = blocks.assign(
             mean=drawn["mean"].isel(record=number).transpose("axis", "block"),
             power=drawn["power"].isel(record=number).transpose("axis", "block", "band"),
@@ -76,8 +51,23 @@ def fit_records(noise_only, change, effect, statistic, columns):
             initial_state(change(record), baseline), list(frame.identified[0].components)
         )
         (fitted,) = fit_identifications(replace(frame, state=state), baseline)
-        out.append(fitted.parameters[columns[0]])
-    return out
+        yield fitted.parameters
+
+
+def change_vibration(noise, g, sensitivity, quartic):
+    """Give a record of noise another vibration, rectified with these sizes."""
+    blocks, baseline = noise
+    drawn = next(null_records(blocks, baseline, count=1, rng=np.random.default_rng(4), chunk=1))
+    shape = xr.DataArray(sensitivity * g**2 + quartic * g**4, dims="block")
+    changed = blocks.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
+    return changed.assign(channel_vibration=blocks["channel_vibration"].copy(data=g))
+
+
+def shake_at_levels(noise, levels):
+    """Return a vibration [g] at two levels, in the second and in the fourth fifth of a record."""
+    place = np.linspace(0.0, 1.0, noise[0].sizes["block"])
+    second, fourth = ((place > low) & (place < low + 0.2) for low in (0.2, 0.6))
+    return np.where(second, levels[0], np.where(fourth, levels[1], 0.0))
 
 
 def coverage(estimates, truth: float) -> float:
@@ -101,7 +91,8 @@ def test_intervals_of_rectification_hold_the_true_value(noise_only, size, power)
             mean=blocks["mean"] + xr.DataArray(size * (g / 6.0) ** power, dims="block")
         )
 
-    estimates = fit_records(noise_only, change, "vibration_rectification", "mean", ("sensitivity",))
+    fits = fit_records(noise_only, change, "vibration_rectification", "mean", ("sensitivity",))
+    estimates = [parameters["sensitivity"] for parameters in fits]
     assert 0.90 <= coverage(estimates, truth) <= 1.0
     assert np.mean([estimate.value for estimate in estimates]) == pytest.approx(
         truth, rel=DEFAULTS.size_error_share
@@ -118,28 +109,18 @@ def test_intervals_of_vibration_noise_hold_the_true_value(noise_only, share):
             power=blocks["power"] * xr.DataArray(1.0 + share * (g / 6.0) ** 2, dims="block")
         )
 
-    estimates = fit_records(noise_only, change, "vibration_noise", "power", ("white",))
+    fits = fit_records(noise_only, change, "vibration_noise", "power", ("white",))
+    estimates = [parameters["white"] for parameters in fits]
     assert 0.88 <= coverage(estimates, truth) <= 1.0
     assert np.mean([estimate.value for estimate in estimates]) == pytest.approx(truth, rel=0.06)
 
 
 @pytest.mark.parametrize(("levels", "has_both_terms"), [((5.0, 5.0), False), ((3.0, 8.0), True)])
 def test_terms_not_separated_by_one_level_become_one(noise_only, levels, has_both_terms):
-    blocks, baseline = noise_only
-    place = np.linspace(0.0, 1.0, blocks.sizes["block"])
-    g = np.where(
-        (place > 0.2) & (place < 0.4),
-        levels[0],
-        np.where((place > 0.6) & (place < 0.8), levels[1], 0.0),
-    )
+    g = shake_at_levels(noise_only, levels)
     g = g + 0.05 * np.random.default_rng(3).random(g.size)
     sensitivity, quartic = (0.05, -5e-4) if has_both_terms else (0.005, 0.0)
-    shape = xr.DataArray(sensitivity * g**2 + quartic * g**4, dims="block")
-    drawn = next(
-        iter(null_records(blocks, baseline, count=1, rng=np.random.default_rng(4), chunk=1))
-    )
-    changed = blocks.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
-    changed["channel_vibration"] = blocks["channel_vibration"].copy(data=g)
+    changed, baseline = change_vibration(noise_only, g, sensitivity, quartic), noise_only[1]
     frame = identify_by_hand(
         changed, baseline, "vibration_rectification", "mean", ("sensitivity", "quartic")
     )
@@ -163,19 +144,9 @@ def test_terms_not_separated_by_one_level_become_one(noise_only, levels, has_bot
     ],
 )
 def test_single_term_is_the_plainest_of_equivalent_ones(noise_only, levels, column):
-    blocks, baseline = noise_only
-    place = np.linspace(0.0, 1.0, blocks.sizes["block"])
-    g = np.where(
-        (place > 0.2) & (place < 0.4),
-        levels[0],
-        np.where((place > 0.6) & (place < 0.8), levels[1], 0.0),
-    )
-    drawn = next(
-        iter(null_records(blocks, baseline, count=1, rng=np.random.default_rng(4), chunk=1))
-    )
-    shape = xr.DataArray(0.005 * g**2 if column == "sensitivity" else 1e-4 * g**4, dims="block")
-    changed = blocks.assign(mean=drawn["mean"].isel(record=0).transpose("axis", "block") + shape)
-    changed["channel_vibration"] = blocks["channel_vibration"].copy(data=g)
+    g = shake_at_levels(noise_only, levels)
+    sizes = (0.005, 0.0) if column == "sensitivity" else (0.0, 1e-4)
+    changed, baseline = change_vibration(noise_only, g, *sizes), noise_only[1]
     frame = identify_by_hand(changed, baseline, "vibration_rectification", "mean", (column,))
     (fitted,) = fit_identifications(settle_forms(frame, baseline), baseline)
     is_one_level = levels[0] == levels[1]

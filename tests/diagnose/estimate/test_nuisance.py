@@ -14,7 +14,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.physics.registry import make_effect
 from gyrostab.wording import format_value
-from tests.diagnose.estimate.test_joint_fit import identify_by_hand
+from tests.support.candidates import identify_by_hand
 from tests.support.named import record
 
 
@@ -47,16 +47,9 @@ def fit_effect(noise_only, effect, statistic, column, *, true, size, named):
     identifications = identify_by_hand(blocks, baseline, effect, statistic, (column,))
     component = identifications.identified[0].components[0]
     design = _variant(identifications, component, true).design
-    if statistic == "mean":
-        changed = blocks.assign(
-            mean=blocks["mean"]
-            + size * np.stack([design[0, 0], 0 * design[0, 0], 0 * design[0, 0]])
-        )
-    else:
-        changed = blocks.assign(
-            power=blocks["power"]
-            + size**2 * np.stack([design[0, 0], 0 * design[0, 0], 0 * design[0, 0]])
-        )
+    size = size if statistic == "mean" else size**2
+    added = size * np.stack([design[0, 0], 0 * design[0, 0], 0 * design[0, 0]])
+    changed = blocks.assign({statistic: blocks[statistic] + added})
     component = replace(component, variant=_variant(identifications, component, named))
     identification = replace(identifications.identified[0], components=(component,))
     state = condition_on(initial_state(changed, baseline), [component])

@@ -24,7 +24,7 @@ from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.physics.electronics import GaussMarkov
 from gyrostab.simulate import simulate
-from tests.support.candidates import make_identifications, select_candidate
+from tests.support.candidates import identify_by_hand, make_identifications
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
 SHAKE = {"profile": "vibration", "points": [[0, 3.0], [850, 3.0], [851, 6.0], [1800, 6.0]]}
@@ -44,25 +44,6 @@ def reduce_simulation(*effects, axes=("x", "y"), environment=(), lost=0.0):
     return reduce_log(
         log.assign(rate=log["rate"].where(is_present).assign_attrs(log["rate"].attrs))
     )
-
-
-def identify_by_hand(blocks, baseline, effect, statistic, columns, **values):
-    """Return the identification of one effect on x, or on both axes if it belongs to the pair."""
-    known, reasons = effect_candidates(blocks, baseline["coefficient"])
-    candidate = select_candidate(known, effect, statistic)
-    fits = [variant for variant in candidate.variants if variant.columns == columns]
-    variant = min(
-        fits,
-        key=lambda variant: sum(
-            abs(1.0 / (1.0 + variant.values[name]) - 1.0 / (1.0 + size))
-            for name, size in values.items()
-        ),
-    )
-    rows = [("x", "y")] if statistic == "cross_spectrum" else [("x",)]
-    components = tuple(Component(candidate, variant, row, 500.0) for row in rows)
-    identification = Selection(effect, candidate.driver, rows[0], components, 500.0, 8.0)
-    state = condition_on(initial_state(blocks, baseline), list(components))
-    return make_identifications([identification], state, known, reasons)
 
 
 def noise_coefficient(baseline, term, axis="x"):
