@@ -37,7 +37,7 @@ from gyrostab.simulate.model import Model
 from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
-_EVERYWHERE = "lattice"  # the anomaly of every sample
+EVERYWHERE = "lattice"  # the mark of every sample: calibrated noise includes what it does
 
 
 class KnownEffects(NamedTuple):
@@ -77,7 +77,7 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
         of_effect = tuple(axes[row] for row in rows)
         sizes = partial(effect.expand_to_axes, axes=of_effect)
         prediction = with_correlated_powers(predict_effect(effect, blocks, of_effect), blocks)
-        has_anomalous_samples = bool({*prediction.marks} - {_EVERYWHERE})
+        has_anomalous_samples = bool({*prediction.marks} - {EVERYWHERE})
         if has_anomalous_samples or _shows_elsewhere(prediction):
             left_out.append(effect.name)
         left[rows] *= _share_left(effect, model, rows, blocks)

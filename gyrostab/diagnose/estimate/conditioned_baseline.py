@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.baseline.known_effects import EVERYWHERE
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.identification import (
     Identifications,
@@ -32,8 +33,6 @@ from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.settings import Settings
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.registry import effects
-
-_EVERYWHERE = "lattice"  # rounding affects every sample, so that the calibrated noise includes it
 
 
 def predict_baseline(
@@ -174,7 +173,7 @@ def add_outlier_power(
         prediction = effect_fit.effect.explain(
             replace(make_windows(blocks, {}), axes=tuple(effect_fit.axes))
         )
-        if _EVERYWHERE in prediction.marks:
+        if EVERYWHERE in prediction.marks:
             continue
         for name, density in prediction.spectrum.items():
             added[rows] += getattr(effect_fit.effect, name) ** 2 * density

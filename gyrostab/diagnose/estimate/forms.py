@@ -44,36 +44,31 @@ def _share_choices(components: Sequence[Component], state: State) -> list[Compon
 
     The default is preferred unless another text is clearly better.
     """
-    choices: list[tuple[float, bool, list[Component]]] = []
     tried: list[dict[str, str]] = []
     for component in components:
-        for texts in (variant.texts for variant in component.candidate.variants):
-            if texts not in tried:
-                tried.append(texts)
+        for variant in component.candidate.variants:
+            if variant.texts not in tried:
+                tried.append(variant.texts)
+    if len(tried) < 2:
+        return [*components]
+    choices: list[tuple[float, bool, list[Component]]] = []
     defaults = {
         item.name: item.default for item in effects()[components[0].candidate.effect].parameters()
     }
-    for texts in tried if len(tried) > 1 else ():
-        matches = [_select_texts(component, state, texts) for component in components]
-        if None not in matches:
-            matching_components = [component for component in matches if component is not None]
+    for texts in tried:
+        selected = [_select_texts(component, state, texts) for component in components]
+        matching = [component for component in selected if component is not None]
+        if len(matching) == len(components):
             nats = sum(
                 _explained_nats(component, state, component.variant)
-                for component in matching_components
+                for component in matching
                 if _has_forms(component)
             )
-            choices.append(
-                (nats, all(defaults[name] == texts[name] for name in texts), matching_components)
-            )
-    top = max((nats for nats, _, _ in choices), default=0.0)
-    usual = [
-        choice
-        for choice in choices
-        if choice[1] and choice[0] > top - state.settings.ambiguous_nats
-    ]
-    return max(usual or choices, key=lambda choice: choice[0], default=(0.0, True, [*components]))[
-        2
-    ]
+            choices.append((nats, all(defaults[name] == texts[name] for name in texts), matching))
+    least = max((nats for nats, _, _ in choices), default=0.0) - state.settings.ambiguous_nats
+    usual = [choice for choice in choices if choice[1] and choice[0] > least]
+    best = max(usual or choices, key=lambda choice: choice[0], default=None)
+    return [*components] if best is None else best[2]
 
 
 def _select_texts(component: Component, state: State, texts: Mapping[str, str]) -> Component | None:
