@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 import xarray as xr
@@ -24,17 +23,9 @@ def line_columns(blocks: xr.Dataset) -> Array:
 
     In degree2 hour-2 Hz-1 per squared unit of the noise table.
     """
-    size, rate = blocks.attrs["block_samples"], blocks.attrs["sampling_rate_hz"]
-    return _line_columns(int(size), float(rate))
-
-
-@lru_cache(maxsize=4)
-def _line_columns(size: int, rate: float) -> Array:
-    """Compute the array of `line_columns`, which a diagnosis needs a hundred times; read-only."""
+    size, rate = int(blocks.attrs["block_samples"]), float(blocks.attrs["sampling_rate_hz"])
     powers = expected_powers(taper(size), rate, ordinates(size)).T
-    columns = np.asarray(powers * np.array([LAWS[term].seconds_factor for term in NOISE]))
-    columns.flags.writeable = False
-    return columns
+    return np.asarray(powers * np.array([LAWS[term].seconds_factor for term in NOISE]))
 
 
 def band_columns(blocks: xr.Dataset) -> Array:

@@ -57,11 +57,11 @@ def fit_filter_sizes(
     """
     kind = effects()[components[0].candidate.effect]
     fits = [_average_powers(component.row[0], state) for component in components]
+    columns = band_columns(state.blocks)
 
     def fit_all(values: Mapping[str, Any]) -> list[tuple[float, float]]:
         response = band_response(kind.example(**values), state.blocks)
-        filtered = band_columns(state.blocks) * response
-        return [fit_behind(fit, mixing @ filtered) for fit, mixing in fits]
+        return [fit_behind(fit, mixing @ (columns * response)) for fit, mixing in fits]
 
     def likelihood(values: Mapping[str, Any]) -> float:
         return sum(nats for nats, _ in fit_all(values))
