@@ -30,7 +30,7 @@ _PEAK_POINTS = 1000  # within a step of a density
 def expect_lines(
     blocks: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], Array]], response: Array
 ) -> dict[str, Array]:
-    """Return lines of effects after a filter (axis, band), as in `KnownEffects.lines`.
+    """Return lines of effects after a filter (axis, band), as variables of a baseline.
 
     The effects come with their axes and their power in the bands.
     """
@@ -41,7 +41,8 @@ def expect_lines(
     )
     steady, largest, broad = (np.zeros(passed.shape) for _ in range(3))
     unspread, band_power = unspread_share(blocks)[..., None], np.zeros((len(axes), bands.size))
-    leak = _line_leakage(int(blocks.attrs["block_samples"]))
+    block_size = int(blocks.attrs["block_samples"])
+    leak, mean_leak, largest_leak = _line_leakage(block_size)
     for effect, rows, density in narrow:
         chosen = tuple(axes[row] for row in rows)
         prediction = predict_effect(effect, blocks, chosen, frequency)
@@ -55,25 +56,15 @@ def expect_lines(
             if peak is not None:
                 broad[rows] += square * peak * passed[rows]
                 continue
-            own_leak = leak[1]
-            if (
-                is_line
-                and places == 1
-                and prediction.line is not None
-                and np.ptp(prediction.line) == 0.0
-            ):
-                apart = (
-                    float(prediction.line.flat[0])
-                    - frequency[int(np.argmax(values.reshape(-1, frequency.size)[0]))]
-                )
-                own_leak = _line_leakage(
-                    int(blocks.attrs["block_samples"]), apart * float(blocks.attrs["block_s"])
-                )[0]
+            own_leak = mean_leak if is_line else leak
+            line = prediction.line
+            if is_line and line is not None and places == 1 and np.ptp(line) == 0.0:
+                nearest = frequency[int(np.argmax(values.reshape(-1, frequency.size)[0]))]
+                apart = (float(line.flat[0]) - nearest) * float(blocks.attrs["block_s"])
+                own_leak = _line_leakage(block_size, apart)[0]
             for row, power in zip(rows, size * passed[rows], strict=True):
-                (steady if is_line else broad)[row] += np.convolve(
-                    power, own_leak if is_line else leak[0], "same"
-                )
-                largest[row] += np.convolve(power, leak[2], "same") if is_line else 0.0
+                (steady if is_line else broad)[row] += np.convolve(power, own_leak, "same")
+                largest[row] += np.convolve(power, largest_leak, "same") if is_line else 0.0
     return {"lines": steady, "lines_most": largest, "peaks": broad, "line_spectrum": band_power}
 
 
