@@ -58,13 +58,9 @@ def log(
     }
     made = simulate(model, duration=duration, rate=rate, seed=seed).compute()
     if lost:
-        gone = np.random.default_rng(seed).random(made.sizes["time"]) < lost
-        made["rate"] = (
-            made["rate"]
-            .where(xr.DataArray(~gone, dims="time"))
-            .transpose("axis", "time")
-            .assign_attrs(made["rate"].attrs)
-        )
+        kept = np.random.default_rng(seed).random(made.sizes["time"]) >= lost
+        kept_rate = made["rate"].where(xr.DataArray(kept, dims="time"))
+        made["rate"] = kept_rate.transpose("axis", "time")
     return made
 
 

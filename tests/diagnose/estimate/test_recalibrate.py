@@ -41,9 +41,7 @@ def reduce_simulation(*effects, axes=("x", "y"), environment=(), lost=0.0):
     is_present = xr.DataArray(
         np.random.default_rng(3).random(log.sizes["time"]) >= lost, dims="time"
     )
-    return reduce_log(
-        log.assign(rate=log["rate"].where(is_present).assign_attrs(log["rate"].attrs))
-    )
+    return reduce_log(log.assign(rate=log["rate"].where(is_present)))
 
 
 def noise_coefficient(baseline, term, axis="x"):

@@ -34,11 +34,7 @@ def raw(seed: int, lost: float, *, axes: str = "x", quantization_step: float = 0
     ).compute()
     gone = np.random.default_rng(7).random((len(axes), log.sizes["time"])) < lost
     gone[:, 9000 : 9000 + int(4000 * lost)] = True
-    log["rate"] = (
-        log["rate"]
-        .where(xr.DataArray(~gone, dims=("axis", "time")))
-        .assign_attrs(log["rate"].attrs)
-    )
+    log["rate"] = log["rate"].where(xr.DataArray(~gone, dims=("axis", "time")))
     return reduce_log(log)
 
 

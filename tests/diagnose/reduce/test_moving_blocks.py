@@ -301,12 +301,7 @@ def sparse_at_rest(turning) -> xr.Dataset:
     lost = np.random.default_rng(3).random(turning.sizes["time"]) < 0.85
     lost[BEGIN:END] = False
     gone = xr.DataArray(lost, dims="time") & (turning["axis"] == "z")
-    return turning.assign(
-        rate=turning["rate"]
-        .where(~gone)
-        .transpose("axis", "time")
-        .assign_attrs(turning["rate"].attrs)
-    )
+    return turning.assign(rate=turning["rate"].where(~gone).transpose("axis", "time"))
 
 
 def test_too_few_samples_at_rest_cannot_be_calibrated(sparse_at_rest):
