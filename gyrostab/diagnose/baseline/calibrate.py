@@ -28,9 +28,9 @@ from gyrostab.diagnose.baseline.posterior import (
     average_blocks,
     fit_filter_response,
     fit_squares,
-    floor_square,
     noise_posterior,
     visible_coefficients,
+    with_floor,
 )
 from gyrostab.diagnose.baseline.quiescent import (
     find_quiescent_blocks,
@@ -170,8 +170,8 @@ def calibrate_axes(
     posteriors = []
     for row, fit in enumerate(_fit_quiescent_powers(blocks, chosen, settings)):
         explained = _keep_explained_bands(fit, settings)
-        square = np.maximum(fit_squares(explained)[0], [0.0, floor_square(explained), 0.0, 0.0])
-        variance = white_variance(blocks, np.tile(square, (len(chosen), 1)))[row]
+        square = with_floor(fit_squares(explained)[0], explained)
+        variance = white_variance(blocks, square[None])[row]
         levels = _level_columns(chosen[row], settings.min_quiescent_blocks)
         posterior = noise_posterior(fit, blocks, row, variance, chosen[row], levels, settings)
         of_means = None if explained is fit else square

@@ -30,7 +30,7 @@ from gyrostab.diagnose.baseline.posterior import (
     average_groups,
     fine_grid,
     fit_squares,
-    floor_square,
+    with_floor,
 )
 from gyrostab.diagnose.evidence.held_out import mean_residual
 from gyrostab.diagnose.evidence.wandering import (
@@ -314,8 +314,7 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
     share = separate_share(shape[chosen], shape_alone[chosen], common[chosen])
     columns = fit.columns
     fit = Fit(fit.power, columns[:, :4], fit.weight * share)
-    square, _, _ = fit_squares(fit)
-    square[1] = max(float(square[1]), floor_square(fit))
+    square = with_floor(fit_squares(fit)[0], fit)
     block, variance = float(blocks.attrs["block_s"]), axis_values(baseline, "mean_variance", axis)
     means = AxisMeans(
         np.where(present[:, None], values, 0.0),

@@ -81,7 +81,7 @@ def separate_share(shape: Array, shape_alone: Array, common: Array) -> float:
 def white_variance(blocks: xr.Dataset, square: Array) -> Array:
     """Return the variance of block means due to Q and N (axis, block) [degree2 hour-2].
 
-    The squares have the shape (axis, 4).
+    The squares have the shape (axis or 1, 4).
     """
     samples = blocks["samples"].values.astype(np.float64)
     neighbours = blocks["neighbours"].values

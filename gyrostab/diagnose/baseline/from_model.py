@@ -160,8 +160,8 @@ def scale_to_quiescent(
     """
     power, shape = (blocks[name].values for name in ("power", "shape"))
     common, shape_alone = common_variance(blocks)
-    factors = []
-    for row, axis in enumerate(blocks["axis"].values):
+    factors, scaled, sizes = [], [], []
+    for row, (axis, posterior) in enumerate(zip(blocks["axis"].values, posteriors, strict=True)):
         good = np.isfinite(power[row]) & np.isfinite(shape[row]) & quiet[row][:, None]
         good &= noise[row] > 0.0
         if not good.any():
@@ -173,18 +173,9 @@ def scale_to_quiescent(
         # see `common_variance`
         reduction = 1.0 / (1.0 + np.where(quiet[row], common[row], 0.0) * separate_shape)
         weight = (shape[row] * np.broadcast_to(reduction[:, None], good.shape))[good]
-        factors.append(_fit_factor(power[row][good], noise[row][good], added[row][good], weight))
-    sizes = ", ".join(
-        f"{math.sqrt(factor):.3g} on axis {axis}"
-        for axis, (factor, _) in zip(blocks["axis"].values, factors, strict=True)
-    )
-    warnings.warn(
-        f"the noise of the simulation is multiplied by {sizes}: its level in the given quiescent "
-        "stretches",
-        stacklevel=2,
-    )
-    scaled = []
-    for row, (posterior, (factor, error)) in enumerate(zip(posteriors, factors, strict=True)):
+        factor, error = _fit_factor(power[row][good], noise[row][good], added[row][good], weight)
+        factors.append(factor)
+        sizes.append(f"{math.sqrt(factor):.3g} on axis {axis}")
         rng = np.random.default_rng(row)
         scatter = rng.gamma(error**-2, error**2, (len(posterior.draws), 1))
         scaled.append(
@@ -198,7 +189,12 @@ def scale_to_quiescent(
                 angle=posterior.angle * factor,
             )
         )
-    return scaled, np.array([factor for factor, _ in factors])
+    warnings.warn(
+        f"the noise of the simulation is multiplied by {', '.join(sizes)}: its level in the given "
+        "quiescent stretches",
+        stacklevel=2,
+    )
+    return scaled, np.array(factors)
 
 
 def _fit_factor(power: Array, noise: Array, added: Array, weight: Array) -> tuple[float, float]:

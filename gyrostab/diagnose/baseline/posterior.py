@@ -222,9 +222,10 @@ def choose_filter(behind: Sequence[Sequence[tuple[float, float]]], settings: Set
     return int(np.where(is_close, quantization, np.inf).argmin())
 
 
-def floor_square(fit: Fit) -> float:
-    """Return the smallest resolved N^2: white noise hides in the smallest power."""
-    return 1e-3 * max(float(np.min(fit.power)), np.finfo(float).tiny) / HOUR
+def with_floor(square: Array, fit: Fit) -> Array:
+    """Return squares with the smallest resolved N^2: white noise hides in the smallest power."""
+    least = 1e-3 * max(float(np.min(fit.power)), np.finfo(float).tiny) / HOUR
+    return np.maximum(square, [0.0, least, 0.0, 0.0])
 
 
 def visible_coefficients(density: float, span: float) -> tuple[float, float]:
@@ -319,7 +320,7 @@ def noise_posterior(
     mean, step = blocks["mean"].values[row], float(blocks.attrs["block_s"])
     present, rng = use & np.isfinite(mean), np.random.default_rng(row)
     square, information, spectrum = fit_squares(fit)
-    density = HOUR * max(float(square[1]), floor_square(fit))
+    density = HOUR * float(with_floor(square, fit)[1])
     coarse_K, coarse_B = fine_grid(density, mean.size * step, step)
     K, B = (axis_values.ravel() for axis_values in np.meshgrid(coarse_K, coarse_B, indexing="ij"))
     means = AxisMeans(

@@ -27,8 +27,8 @@ from gyrostab.diagnose.baseline.posterior import (
     Posterior,
     average_groups,
     fit_squares,
-    floor_square,
     noise_posterior,
+    with_floor,
 )
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.evidence.wandering import RandomProcesses, expected_processes
@@ -316,9 +316,8 @@ def _fit_noise(
     plain = float((fit.weight / np.square(fit.start) * fit.columns[:, 1] ** 2).sum())
     if not information[1, 1] > state.settings.min_information_share * plain or not square[1] > 0.0:
         return None
-    square = np.maximum(square, [0.0, floor_square(fit), 0.0, 0.0])
-    count = blocks.sizes["axis"]
-    variance = white_variance(blocks, np.tile(square, (count, 1)))[row]
+    square = with_floor(square, fit)
+    variance = white_variance(blocks, square[None])[row]
     unfiltered = noise_powers(blocks)[row, :, 0] @ square
     variance = variance * np.maximum(state.weight[row, :, 0] / unfiltered, 0.1)
     effect_means = np.stack(axis_effects.means, axis=1) if axis_effects.means else None

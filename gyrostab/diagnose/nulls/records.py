@@ -271,7 +271,7 @@ def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.G
     blocks, baseline = setup.blocks, setup.baseline
     n, step = blocks.sizes["block"], float(blocks.attrs["block_s"])
     unit_variance = np.stack(
-        [white_variance(blocks, np.tile(unit, (len(slow[0]), 1))) for unit in np.eye(4)[:2]],
+        [white_variance(blocks, unit[None]) for unit in np.eye(4)[:2]],
         axis=-1,
     )
     usual = np.einsum("abn,an->ab", unit_variance, baseline["square"].values[:, :2])
