@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 from scipy.special import chdtrc
 
 from gyrostab.diagnose.baseline.calibrate import MIN_BANDS, assemble_baseline, calibrate_axes
@@ -164,9 +165,9 @@ def _line_statistics(
     )
     evidence_nats = line_evidence(power[None], weight, slope)[0]
     lines, largest, peaks = (np.zeros(evidence_nats.shape) for _ in range(3))
-    near_unexplained = unexplained.copy()
-    near_unexplained[:, 1:] |= unexplained[:, :-1]
-    near_unexplained[:, :-1] |= unexplained[:, 1:]
+    near_unexplained = binary_dilation(
+        unexplained, np.ones((1, 3), np.bool_)
+    )  # and bands next to them
     lines_per_band = np.diff(band_edges(int(simulated.attrs["block_samples"])))
     near_unexplained = np.repeat(near_unexplained, lines_per_band, axis=1)
     for row, axis in enumerate(simulated["axis"].values):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.ndimage import binary_propagation
+from scipy.ndimage import binary_dilation, binary_propagation
 
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -79,9 +79,8 @@ def moving_blocks_of_axis(mean: Array, span: float, settings: Settings) -> NDArr
     place = np.flatnonzero(good)  # neighbours are those among the blocks that are there
     has_left_rest = (away > NORMAL_95 * scale)[place]
     whole_motion = binary_propagation(is_moving[place], mask=has_left_rest)  # from rest to rest
-    is_near_motion = (
-        np.convolve(whole_motion, np.ones(2 * settings.motion_margin_blocks + 1), "same") > 0.5
-    )
+    near = np.ones(2 * settings.motion_margin_blocks + 1, np.bool_)
+    is_near_motion = binary_dilation(whole_motion, near)
     out = nothing.copy()
     out[place] = is_near_motion
     has_rest = (

@@ -33,6 +33,7 @@ from gyrostab.simulate.noise import make_noise
 from tests.support.repetitions import first_of
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
+WARM = {"profile": "ramps", "channel": "temperature", "unit": "degC"}
 SHAKEN = {
     "profile": "vibration",
     "points": [[0, 0.02], [1199, 0.02], [1200, 6.0], [1500, 6.0], [1501, 0.02], [3600, 0.02]],
@@ -124,12 +125,7 @@ def test_common_variance_of_a_block_is_as_expected():
 
 
 def test_blocks_with_vibration_rotation_or_heating_are_not_quiescent():
-    warm = {
-        "profile": "ramps",
-        "channel": "temperature",
-        "unit": "degC",
-        "points": [[0, 30], [2700, 30], [3600, 60]],
-    }
+    warm = WARM | {"points": [[0, 30], [2700, 30], [3600, 60]]}
     blocks = reduce_log(log(environment=[SHAKEN, warm], duration="1h"))
     quiet = find_quiescent_blocks(blocks)
     middle = ((blocks["begin"] + blocks["end"]) / 2.0).values
@@ -199,12 +195,7 @@ def test_baseline_from_a_model_includes_its_effects():
         {"name": "temperature_bias", "sensitivity": 0.01, "axes": ["y"]},
         {"name": "telegraph", "step": 0.1},
     ]
-    warm = {
-        "profile": "ramps",
-        "channel": "temperature",
-        "unit": "degC",
-        "points": [[0, 30], [3600, 60]],
-    }
+    warm = WARM | {"points": [[0, 30], [3600, 60]]}
     model = {
         "noise": {"N": 0.003, "R": 0.1},
         "effect": effects,

@@ -27,6 +27,7 @@ from gyrostab.simulate import simulate
 from tests.support.candidates import identify_by_hand, make_identifications
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
+HEAT = {"profile": "ramps", "channel": "temperature", "unit": "degC"}
 SHAKE = {"profile": "vibration", "points": [[0, 3.0], [850, 3.0], [851, 6.0], [1800, 6.0]]}
 
 
@@ -91,12 +92,7 @@ def test_diagnosis_separates_noise_and_effects(shaken):
 def test_relative_size_refers_to_the_recalibrated_noise():
     """Warm throughout: the first calibration has twice the noise and more, and the growth relative
     to it."""
-    heat = {
-        "profile": "ramps",
-        "channel": "temperature",
-        "unit": "degC",
-        "points": [[0, 35], [600, 35], [601, 50], [1200, 50], [1201, 65], [1800, 65]],
-    }
+    heat = HEAT | {"points": [[0, 35], [600, 35], [601, 50], [1200, 50], [1201, 65], [1800, 65]]}
     blocks = reduce_simulation(
         {"name": "temperature_noise", "linear": 0.05, "axes": ["x"]}, environment=[heat]
     )
@@ -111,12 +107,7 @@ def test_relative_size_refers_to_the_recalibrated_noise():
 
 def test_noise_is_that_of_the_form_in_the_model():
     """The evidence may prefer the square of the temperature; the model has the plainer law."""
-    heat = {
-        "profile": "ramps",
-        "channel": "temperature",
-        "unit": "degC",
-        "points": [[0, 50], [900, 60], [1800, 50]],
-    }
+    heat = HEAT | {"points": [[0, 50], [900, 60], [1800, 50]]}
     blocks = reduce_simulation(
         {"name": "temperature_noise", "linear": 0.03, "axes": ["x"]}, environment=[heat]
     )
@@ -134,12 +125,7 @@ def test_noise_is_that_of_the_form_in_the_model():
 
 def test_noise_that_changes_far_from_its_reference_has_the_level_of_the_record():
     """Nothing determines N at 25 degrees: the model keeps that of the record at its temperature."""
-    heat = {
-        "profile": "ramps",
-        "channel": "temperature",
-        "unit": "degC",
-        "points": [[0, 58], [600, 58], [601, 62], [1200, 62], [1201, 66], [1800, 66]],
-    }
+    heat = HEAT | {"points": [[0, 58], [600, 58], [601, 62], [1200, 62], [1201, 66], [1800, 66]]}
     truth = {"name": "temperature_noise", "linear": 0.12, "reference": 62.0, "axes": ["x"]}
     blocks = reduce_simulation(truth, environment=[heat])
     baseline = calibrate_noise(blocks)
