@@ -165,9 +165,7 @@ def _line_statistics(
     )
     evidence_nats = line_evidence(power[None], weight, slope)[0]
     lines, largest, peaks = (np.zeros(evidence_nats.shape) for _ in range(3))
-    near_unexplained = binary_dilation(
-        unexplained, np.ones((1, 3), np.bool_)
-    )  # and bands next to them
+    near_unexplained = binary_dilation(unexplained, np.ones((1, 3), np.bool_))
     lines_per_band = np.diff(band_edges(int(simulated.attrs["block_samples"])))
     near_unexplained = np.repeat(near_unexplained, lines_per_band, axis=1)
     for row, axis in enumerate(simulated["axis"].values):

@@ -11,14 +11,18 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.expected_statistics import NOISE, band_columns, line_columns
+from gyrostab.diagnose.baseline.expected_statistics import (
+    NOISE,
+    band_columns,
+    line_columns,
+    undo_transfer,
+)
 from gyrostab.diagnose.baseline.known_lines import (
     expect_lines,
     independent_line_share,
     line_factors,
     resonance_density,
 )
-from gyrostab.diagnose.baseline.sample_transfer import undo_transfer
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import (
     average_in_bands,

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.sample_transfer import PassedNoise, undo_transfer
+from gyrostab.diagnose.baseline.expected_statistics import PassedNoise, undo_transfer
 from gyrostab.diagnose.predict.windows import predict_effect
 from gyrostab.diagnose.reduce.schema import weighted_mean
 from gyrostab.physics.base import Effect
