@@ -25,8 +25,7 @@ from gyrostab.diagnose.estimate.unexplained_motion import unexplained_motion
 from gyrostab.diagnose.identify.examination import prepare_examination
 from gyrostab.diagnose.identify.identification import components_of
 from gyrostab.diagnose.identify.selection import identify_effects
-from gyrostab.diagnose.locate.mismatches import locate_mismatches
-from gyrostab.diagnose.locate.regions import Region
+from gyrostab.diagnose.locate.mismatches import Region, locate_mismatches
 from gyrostab.diagnose.nulls.records import repeatable_null_records
 from gyrostab.diagnose.nulls.scores import NullScores, null_scores
 from gyrostab.diagnose.reduce.aligned_channels import align_channels

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.identify.identification import Selection
-from gyrostab.diagnose.locate.regions import Region
+from gyrostab.diagnose.locate.mismatches import Region
 from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.known_effects import remove_known_motion
 from gyrostab.diagnose.identify.identification import Selection, components_of
-from gyrostab.diagnose.locate.regions import Region
+from gyrostab.diagnose.locate.mismatches import Region
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import drop_changed_tails

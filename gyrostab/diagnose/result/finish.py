@@ -25,7 +25,7 @@ from gyrostab.diagnose.identify.identification import (
     Selection,
     reduce_selection,
 )
-from gyrostab.diagnose.locate.regions import Region
+from gyrostab.diagnose.locate.mismatches import Region
 from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.result.attribution import attribute_mismatches

@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.diagnose.identify.examination import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.identify.identification import Identifications, Selection, components_of
-from gyrostab.diagnose.locate.regions import Region
+from gyrostab.diagnose.locate.mismatches import Region
 from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
 from gyrostab.diagnose.reduce.block_statistics import iso, measured
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks

@@ -94,7 +94,7 @@ def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
     Parameters
     ----------
     region : mapping
-        Fields of `gyrostab.diagnose.locate.regions.Region`, with ``axes`` as a list.
+        Fields of `gyrostab.diagnose.locate.mismatches.Region`, with ``axes`` as a list.
 
     Examples
     --------

@@ -9,8 +9,7 @@ import pytest
 import xarray as xr
 from scipy import stats
 
-from gyrostab.diagnose.locate.mismatches import locate_mismatches
-from gyrostab.diagnose.locate.regions import merge_regions
+from gyrostab.diagnose.locate.mismatches import locate_mismatches, merge_regions
 from gyrostab.diagnose.nulls.scores import null_scores
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.ingest.make_log import make_log

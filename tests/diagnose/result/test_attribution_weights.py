@@ -9,8 +9,7 @@ import pytest
 
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.identify.identification import Selection
-from gyrostab.diagnose.locate.mismatches import locate_mismatches
-from gyrostab.diagnose.locate.regions import merge_regions
+from gyrostab.diagnose.locate.mismatches import locate_mismatches, merge_regions
 from gyrostab.diagnose.nulls.scores import null_scores
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import MIN_POWER_RATIO, condition_on, fit_powers

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from gyrostab.diagnose.locate.mismatches import locate_mismatches
-from gyrostab.diagnose.locate.regions import merge_regions
+from gyrostab.diagnose.locate.mismatches import locate_mismatches, merge_regions
 from gyrostab.diagnose.nulls.scores import null_scores, standardise
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.result.attribution import attribute_mismatches

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.locate.mismatches import locate_mismatches
-from gyrostab.diagnose.locate.regions import merge_regions
+from gyrostab.diagnose.locate.mismatches import locate_mismatches, merge_regions
 from gyrostab.diagnose.nulls.records import _correlate_lines
 from gyrostab.diagnose.nulls.scores import null_scores, standardise
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
