@@ -79,15 +79,14 @@ def baseline_from_model(
     if given_blocks is not None:
         chosen = given_blocks
         attrs["calibrated_on"] = find_quiescent_spans(blocks, chosen)
-        square = np.stack([posterior.square for posterior in posteriors])
+        squares = np.stack([posterior.square for posterior in posteriors])
         spectrum, added = (
             expect_known_effects(blocks, parsed, values).spectrum
-            for values in (square, 0.0 * square)
+            for values in (squares, 0.0 * squares)
         )
         posteriors, _ = scale_to_quiescent(blocks, posteriors, spectrum - added, added, chosen)
-    effects = expect_known_effects(
-        blocks, parsed, np.stack([posterior.square for posterior in posteriors])
-    )
+    squares = np.stack([posterior.square for posterior in posteriors])
+    effects = expect_known_effects(blocks, parsed, squares)
     attrs["left_out"] = effects.left_out
     hours = (blocks["begin"].values + blocks["end"].values) / (2.0 * HOUR)
     ramp = np.array([parsed.coefficients(axis)["R"] for axis in axes])
@@ -103,7 +102,7 @@ def baseline_from_model(
     out["mean_variance"] *= effects.white_share
     out = out.assign(label_variables(effects.variables, BASELINE))
     if "line_noise" in out or "peaks" in out:
-        _describe_lines(out, blocks, np.stack([posterior.square for posterior in posteriors]))
+        _describe_lines(out, blocks, squares)
     out["coefficient"].loc[{"term": "R"}] = ramp
     out["stderr"].loc[{"term": list(TERMS) if given_blocks is None else ["R"]}] = 0.0
     return out
@@ -114,7 +113,8 @@ def _describe_lines(baseline: xr.Dataset, blocks: xr.Dataset, square: Array) -> 
 
     Where the lines of a resonance dominate, the power of the band has fewer degrees of freedom.
     """
-    density = np.stack([line_columns(blocks) @ axis_square for axis_square in square])
+    columns = line_columns(blocks)
+    density = np.stack([columns @ axis_square for axis_square in square])
     if "line_noise" in baseline:
         density = baseline["line_noise"].values
         smooth = interpolate_bands(

@@ -79,8 +79,8 @@ def moving_blocks_of_axis(mean: Array, span: float, settings: Settings) -> NDArr
     place = np.flatnonzero(good)  # neighbours are those among the blocks that are there
     has_left_rest = (away > NORMAL_95 * scale)[place]
     whole_motion = binary_propagation(is_moving[place], mask=has_left_rest)  # from rest to rest
-    near = np.ones(2 * settings.motion_margin_blocks + 1, np.bool_)
-    is_near_motion = binary_dilation(whole_motion, near)
+    margins = np.ones(2 * settings.motion_margin_blocks + 1, np.bool_)
+    is_near_motion = binary_dilation(whole_motion, margins)
     out = nothing.copy()
     out[place] = is_near_motion
     has_rest = (
