@@ -246,9 +246,7 @@ def zeros_beyond_chance(
         chance = zeros * (1.0 - (1.0 - share) ** 2)
     else:
         all_zero = probability_all_zero(share, subset)
-        chance = np.moveaxis(
-            np.tensordot(subset.T.astype(np.float64), all_zero * at_once, axes=(1, -2)), 0, -2
-        )
+        chance = np.einsum("sa,...sb->...ab", subset, all_zero * at_once)
     return np.asarray(np.maximum(together - np.rint(chance), 0), np.int64)
 
 
@@ -257,12 +255,7 @@ def probability_all_zero(share: Array, subset: NDArray[np.bool_]) -> Array:
 
     The shares of zeros are (..., axis, block).
     """
-    return np.asarray(
-        np.stack(
-            [np.prod(share[..., np.flatnonzero(members), :], axis=-2) for members in subset],
-            axis=-2,
-        )
-    )
+    return np.asarray(np.where(subset[..., None], share[..., None, :, :], 1.0).prod(axis=-2))
 
 
 def quantization_step(values: Array) -> float:
