@@ -114,9 +114,7 @@ def fit_squares(fit: Fit) -> tuple[Array, Array, Array]:
     square[1] = max(
         float((fit.weight * fit.rest() / fit.columns[:, 1]).sum() / fit.weight.sum()), 0.0
     )
-    spectrum = np.asarray(
-        fit.columns @ square if fit.start is None else fit.start, dtype=np.float64
-    )
+    spectrum = fit.columns @ square if fit.start is None else fit.start
     free_columns, precision = fit.free()
     # Otherwise the likelihood is not that of these powers alone.
     has_powers_only = not free_columns.shape[1] and fit.known is None and fit.start is None
@@ -126,14 +124,11 @@ def fit_squares(fit: Fit) -> tuple[Array, Array, Array]:
             free_columns, precision, fit.columns, fit.rest(), weight
         )
         solution = solve_nonnegative(normal, right)
-        next_spectrum = np.asarray(fit.columns @ solution, dtype=np.float64)
+        next_spectrum = fit.columns @ solution
         if free_columns.shape[1] or fit.known is not None:
-            next_spectrum = (
-                next_spectrum
-                + (fit.power - fit.rest())
-                + free_columns @ (to_right - to_noise @ solution)
-            )
-            next_spectrum = np.asarray(np.maximum(next_spectrum, _MIN_POWER_RATIO * spectrum))
+            of_effects = free_columns @ (to_right - to_noise @ solution)
+            next_spectrum = next_spectrum + (fit.power - fit.rest()) + of_effects
+            next_spectrum = np.maximum(next_spectrum, _MIN_POWER_RATIO * spectrum)
         if not (next_spectrum > 0.0).all():
             break
         fraction = _choose_step(fit, spectrum, next_spectrum) if has_powers_only else 1.0
@@ -143,7 +138,7 @@ def fit_squares(fit: Fit) -> tuple[Array, Array, Array]:
         spectrum = next_spectrum
         if change < 1e-9:
             break
-    return square, np.asarray(normal, dtype=np.float64), spectrum
+    return square, normal, spectrum
 
 
 def _choose_step(fit: Fit, spectrum: Array, next_spectrum: Array) -> float:
@@ -174,10 +169,8 @@ def _eliminate_free_sizes(
     inner = (free_columns.T * weight) @ free_columns + np.diag(precision)
     inner += 1e-9 * np.diag(np.maximum(np.diagonal(inner), 1e-300))
     crossed = weighted @ free_columns
-    to_noise = np.asarray(np.linalg.solve(inner, crossed.T), dtype=np.float64)
-    to_right = np.asarray(
-        np.linalg.solve(inner, (free_columns.T * weight) @ power), dtype=np.float64
-    )
+    to_noise = np.asarray(np.linalg.solve(inner, crossed.T), np.float64)
+    to_right = np.asarray(np.linalg.solve(inner, (free_columns.T * weight) @ power), np.float64)
     return normal - crossed @ to_noise, right - crossed @ to_right, to_noise, to_right
 
 
@@ -268,7 +261,7 @@ def _likelihood_of_powers(
     likelihood = -(fit.weight * (np.log(expected) + fit.power / expected)).sum(axis=1)
     if free_columns.shape[1]:
         normal = np.linalg.inv(np.linalg.inv(normal)[:2, :2])
-    return np.asarray(likelihood), np.asarray(best[:, :2]), normal
+    return likelihood, best[:, :2], normal
 
 
 def _normal_matrix(fast_columns: Array, weight: Array, precision: Array) -> Array:
@@ -348,7 +341,7 @@ def noise_posterior(
     covariance = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
     error = np.sqrt(np.diag(covariance))
     if joined:
-        spread = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+        spread = np.asarray(np.linalg.inv(normal), np.float64)
         squares = np.concatenate([_draw_near(best[cell], spread, rng), slow_draws], axis=1)
     else:
         squares = np.maximum(square + error * rng.standard_normal((DRAWS, 4)), 0.0)
