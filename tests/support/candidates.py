@@ -65,6 +65,7 @@ def identify_by_hand(
     columns: tuple[str, ...],
     *,
     axis: str = "x",
+    evidence_nats: float = 500.0,
     **values: float,
 ) -> Identifications:
     """Return the identification of one effect on an axis, or on x and y if it belongs to the pair.
@@ -81,7 +82,7 @@ def identify_by_hand(
         ),
     )
     row = ("x", "y") if statistic == "cross_spectrum" else (axis,)
-    component = Component(candidate, variant, row, 500.0)
-    identification = Selection(effect, candidate.driver, row, (component,), 500.0, 8.0)
+    component = Component(candidate, variant, row, evidence_nats)
+    identification = Selection(effect, candidate.driver, row, (component,), evidence_nats, 8.0)
     state = condition_on(initial_state(blocks, baseline), [component])
     return make_identifications([identification], state, candidates, reasons)

@@ -14,7 +14,6 @@ from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.linear_model import initial_state
 from tests.diagnose.estimate import test_joint_fit as joint_fit
-from tests.support.candidates import identify_by_hand
 from tests.support.named import WORLD, record
 
 RECORDS, SECONDS, BLOCK = 20, 3600, 20
@@ -123,7 +122,7 @@ def test_limit_of_an_effect_slower_than_the_grid():
     )
     blocks = record([], environment=environment)
     baseline = calibrate_noise(blocks)
-    frame = identify_by_hand(blocks, baseline, "shupe", "mean", ("sensitivity",))
+    frame = joint_fit.identify_by_hand(blocks, baseline, "shupe", "mean", ("sensitivity",))
     frame = replace(
         frame,
         identified=(),

@@ -14,7 +14,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.physics.registry import make_effect
 from gyrostab.wording import format_value
-from tests.support.candidates import identify_by_hand
+from tests.diagnose.estimate.test_joint_fit import identify_by_hand
 from tests.support.named import record
 
 
