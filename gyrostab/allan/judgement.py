@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from itertools import zip_longest
 
 import numpy as np
 import xarray as xr
@@ -127,7 +128,7 @@ def _judge_sampling(product: xr.Dataset) -> str:
     half_window = np.timedelta64(round(0.5e9 * product.attrs.get("window_s", 0.0)), "ns")
     times = product["time"].values
     changes = texts(product, "rate_changes")
-    for begin, end in zip(changes[::2], changes[1::2], strict=True):
+    for begin, end in zip_longest(changes[::2], changes[1::2], fillvalue=str(times.max())):
         first, last = np.datetime64(begin), np.datetime64(end)
         if first < times.max() + half_window and last > times.min() - half_window:
             span = " to ".join(text[:19].replace("T", " ") for text in (begin, end))
