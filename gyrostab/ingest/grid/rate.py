@@ -113,7 +113,9 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
         )
     steps = np.concatenate([np.diff(part) for part in parts])
     backwards = float((steps < 0).mean())
-    if not (steps > 0).any() or backwards > _MAX_BACKWARD_SHARE:
+    has_order = (steps > 0).any() and backwards <= _MAX_BACKWARD_SHARE
+    estimate = _estimate_ordered(stamps, stretches, parts, sure) if has_order else None
+    if estimate is None or estimate.rate <= 0.0:
         problem = (
             "time runs backwards"
             if backwards > 1 - _MAX_BACKWARD_SHARE
@@ -125,6 +127,12 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
             f"{where}: {problem} throughout; check the time column and its unit, or leave it out "
             "(--map) and give --rate HZ"
         )
+    return estimate
+
+
+def _estimate_ordered(stamps: Stamps, stretches: Parts, parts: Parts, sure: float) -> RateEstimate:
+    """Find the sampling rate of stamps that mostly rise; not positive if they fall on the whole."""
+    steps = np.concatenate([np.diff(part) for part in parts])
     period, counted, coarse = starting_period(stretches)
     finer = None if counted else finer_period(parts, period)
     lost = None if finer is None else _estimate_sharp(stamps, parts, SECOND / finer)
