@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gyrostab import davar, fit_noise
+from gyrostab import davar, fit_noise, make_log
 from gyrostab.allan.judgement import judge_product, smallest_observable, suggest_windows
 from gyrostab.noise import LAWS
 from gyrostab.schema import NOT_OBSERVABLE, OBSERVED, UPPER_LIMIT_ONLY
@@ -50,6 +50,22 @@ def test_a_steady_product_is_called_steady():
     steady, terms = judge_product(_make_product({}))
     assert steady.startswith("N is steady: it varies by 0 % on x, 0 % on y, 0 % on z")
     assert terms.startswith("All five terms are observed")
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_wrong"),
+    [
+        (["2026-01-01T00:20", "2026-01-01T00:40"], False),  # after the windows
+        (["2025-12-31T23:00", "2025-12-31T23:50"], False),  # before them
+        (["2025-12-31T23:00", "2025-12-31T23:50", "2026-01-01T00:05", "2026-01-01T00:06"], True),
+        (["2026-01-01T00:05"], True),  # without its end
+    ],
+)
+def test_only_windows_at_another_rate_cannot_be_judged(changes, is_wrong):
+    noise = np.random.default_rng(2).standard_normal(6000)
+    log = make_log(noise, rate=10.0, unit="deg/h", start="2026-01-01")
+    product = fit_noise(davar(log, window="60s")).assign_attrs(rate_changes=changes)
+    assert ("at another rate than 10 Hz" in judge_product(product)[0]) == is_wrong
 
 
 def test_a_change_names_its_channel_axis_and_size():

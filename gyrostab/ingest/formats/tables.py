@@ -249,10 +249,12 @@ def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _
         if table.stamps is not None:
             is_first_clock = all(held.stamps is None for held in filled)
             header = table.stamps.name[-1] if is_first_clock else ""
-            described.append(_describe(table.stamps, header, stamped=table.stamps.unit is None))
+            described.append(
+                _describe_column(table.stamps, header, stamped=table.stamps.unit is None)
+            )
             stored.append(table.stamps)
         filled.append(table)
-        described += map(_describe, table.columns, own_names)
+        described += map(_describe_column, table.columns, own_names)
         stored += table.columns
     if not filled:
         raise FormatError(
@@ -270,7 +272,7 @@ def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _
     return _leave_out_unplaced(planned)
 
 
-def _describe(column: TableColumn, name: str, *, stamped: bool = False) -> FileColumn:
+def _describe_column(column: TableColumn, name: str, *, stamped: bool = False) -> FileColumn:
     calendar = attribute_text((column.attributes or {}).get("calendar")) or None
     return FileColumn(name, column.unit, calendar, stamped=stamped, target=column.target)
 

@@ -131,7 +131,7 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
 
 
 def _estimate_ordered(stamps: Stamps, stretches: Parts, parts: Parts, sure: float) -> RateEstimate:
-    """Find the sampling rate of stamps that mostly rise; not positive if they fall on the whole."""
+    """Find the sampling rate of stamps that mostly rise; a damaged file may give a negative one."""
     steps = np.concatenate([np.diff(part) for part in parts])
     period, counted, coarse = starting_period(stretches)
     finer = None if counted else finer_period(parts, period)

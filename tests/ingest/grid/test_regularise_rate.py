@@ -304,9 +304,9 @@ def test_even_stamps_and_then_shared_ones(
 @pytest.mark.parametrize(
     "rates",
     [
-        pytest.param((10.0, 50.0), marks=pytest.mark.full),
+        (10.0, 50.0),
         pytest.param((10.0, 1.0), marks=pytest.mark.full),
-        (100.0, 80.0),
+        pytest.param((100.0, 80.0), marks=pytest.mark.full),
     ],
 )
 def test_noise_is_not_judged_across_a_change_of_the_rate(rates, tmp_path):
