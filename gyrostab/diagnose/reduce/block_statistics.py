@@ -142,15 +142,22 @@ def measured(blocks: xr.Dataset, name: str) -> xr.DataArray:
 
 
 def noise_at_orders(blocks: xr.Dataset, expected: Array) -> Array:
-    """Return the noise density near the rotation orders: the expected or a higher measured one.
+    """Return the noise density near the rotation orders, as expected or as measured next to them.
 
     Waves unrelated to the tool, such as those of the ground, have the same power at an order as
-    next to it. Densities are by (..., axis, block, harmonic).
+    next to it. A density that the order itself raises is not noise: the measured density next to it
+    gives the level of the expected one, and replaces it in blocks with much more. Densities are by
+    (..., axis, block, harmonic).
     """
     if "order_level" not in blocks:
         return expected
     nearby = blocks["order_level"].values
-    return np.where(nearby > _MIN_NEIGHBOUR_RATIO * expected, nearby, expected)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = nearby / expected
+    usual = np.isfinite(ratio) & (ratio <= _MIN_NEIGHBOUR_RATIO)
+    number = usual.sum(axis=-2, keepdims=True)
+    level = np.where(usual, ratio, 0.0).sum(axis=-2, keepdims=True) / np.maximum(number, 1)
+    return np.where(ratio > _MIN_NEIGHBOUR_RATIO, nearby, expected * np.where(number, level, 1.0))
 
 
 def iso(blocks: xr.Dataset, seconds: float) -> str:

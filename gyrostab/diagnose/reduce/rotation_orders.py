@@ -19,7 +19,8 @@ from gyrostab.units import INNER, parse_unit
 Array = NDArray[np.float64]
 #: Multiples of the tool rotation that are measured.
 HARMONICS = (1, 2, 3)
-_NEIGHBOUR_TURNS = (1, 5)  # range, turns per block from an order at which its noise is measured
+#: Turns per block from an order at which its noise is measured.
+_NEIGHBOURS = np.array([-4, -3, -2, -1, 1, 2, 3, 4])
 #: Variance of an amplitude in the samples that are there, over that of an even rotation, 2 / n.
 #: Design choice: the error assumed is too small by 30 % at most.
 _MAX_VARIANCE_RATIO = 2.0
@@ -75,11 +76,13 @@ class RotationOrders:
         ]
         # a harmonic above half of the sampling rate has the samples of one below
         is_sampled = np.abs(often)[:, None] * HARMONICS < self.length / 2.0
-        order, residual = _fit_harmonics(centred, wheels, enough, is_sampled)
+        order, residual, noise_left = _fit_harmonics(centred, wheels, enough, is_sampled)
         order_level = []
         with np.errstate(invalid="ignore", divide="ignore"):
-            for harmonic, wheel in zip(HARMONICS, wheels, strict=True):
-                level = _power_near_order(residual * wheel, often, harmonic)
+            for place, (harmonic, wheel) in enumerate(zip(HARMONICS, wheels, strict=True)):
+                level = _level_near_order(
+                    residual * wheel, noise_left[:, :, place], often, harmonic
+                )
                 order_level.append(np.where(enough, level / (counts * self.rate), np.nan))
         return {
             "order": order,
@@ -101,7 +104,7 @@ def _fit_harmonics(
     wheels: Sequence[NDArray[np.complex128]],
     enough: NDArray[np.bool_],
     is_sampled: NDArray[np.bool_],
-) -> tuple[NDArray[np.complex128], Array]:
+) -> tuple[NDArray[np.complex128], Array, Array]:
     """Fit a constant and harmonics to the samples of each block by least squares.
 
     Where the rotation is uneven, as in stick-slip, or samples are missing, harmonics are not
@@ -127,10 +130,14 @@ def _fit_harmonics(
         Complex; NaN where not fitted.
     residual : ndarray, shape (axis, block, sample)
         Values less the harmonics; zero where samples are missing.
+    noise_left : ndarray, shape (axis, block, harmonic, neighbour)
+        Share of white noise that the residual has at the `_NEIGHBOURS` of each harmonic.
     """
     basis = np.stack([part for wheel in wheels for part in (wheel.real, -wheel.imag)], axis=-1)
     amplitudes = np.full((*enough.shape, len(wheels)), np.nan + 0j)
-    residual = values.copy()
+    residual, noise_left = values.copy(), np.ones((*amplitudes.shape, _NEIGHBOURS.size))
+    size = values.shape[-1]
+    away = np.exp(-2j * math.pi * np.arange(size)[:, None] * _NEIGHBOURS / size)
     for axis, block in np.argwhere(enough):
         present, fitted = values[axis, block] != 0.0, is_sampled[block]
         columns = basis[block][present][:, np.repeat(fitted, 2)]
@@ -144,7 +151,10 @@ def _fit_harmonics(
         sizes = (inverse @ (left.T @ values[axis, block, present]))[:-1]
         amplitudes[axis, block, fitted] = sizes[::2] - 1j * sizes[1::2]
         residual[axis, block, present] -= columns @ sizes
-    return amplitudes, residual
+        for place, wheel in enumerate(wheels):
+            fitted_part = left.T @ (wheel[block, present, None] * away[present])
+            noise_left[axis, block, place] -= (np.abs(fitted_part) ** 2).sum(axis=0) / len(columns)
+    return amplitudes, residual, noise_left
 
 
 def make_rotation_orders(log: xr.Dataset, length: int, rate: float) -> RotationOrders | None:
@@ -163,17 +173,19 @@ def make_rotation_orders(log: xr.Dataset, length: int, rate: float) -> RotationO
     return None
 
 
-def _power_near_order(turned: NDArray[np.complex128], often: Array, harmonic: int) -> Array:
-    """Measure the mean power (axis, block) a few turns per block from a harmonic, NaN if unknown.
+def _level_near_order(
+    turned: NDArray[np.complex128], noise_left: Array, often: Array, harmonic: int
+) -> Array:
+    """Measure the mean power (axis, block) of the noise next to a harmonic, NaN if unknown.
 
-    The samples (axis, block, sample) have no harmonics, and are demodulated by this one; the tool
-    turns so often (block,), negative if it turns back. Lines at which the block mean or a harmonic
-    was removed, and their mirror lines, do not count.
+    The samples (axis, block, sample) have no harmonics, and are demodulated by this one; of the
+    noise at its neighbours they have the share left (axis, block, neighbour). The tool turns so
+    often (block,), negative if it turns back. Lines at which the block mean or a harmonic was
+    removed, and their mirror lines, do not count.
     """
-    neighbours = np.concatenate([-np.arange(*_NEIGHBOUR_TURNS)[::-1], np.arange(*_NEIGHBOUR_TURNS)])
-    power = np.abs(np.fft.fft(turned, axis=-1)[..., neighbours]) ** 2
-    place = np.abs(harmonic * often[:, None] + neighbours)
+    power = np.abs(np.fft.fft(turned, axis=-1)[..., _NEIGHBOURS]) ** 2
+    place = np.abs(harmonic * often[:, None] + _NEIGHBOURS)
     removed = np.abs(often)[:, None, None] * np.array([0, *HARMONICS])
     free = (np.abs(place[..., None] - removed) >= _MIN_TURNS_APART).all(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray((power * free).sum(axis=-1) / free.sum(axis=-1))
+        return np.asarray((power * free).sum(axis=-1) / (noise_left * free).sum(axis=-1))

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from gyrostab.diagnose.reduce.block_statistics import block_samples, reduce_log
+from gyrostab.diagnose.reduce.block_statistics import block_samples, noise_at_orders, reduce_log
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.spectra.periodogram import band_covariance, band_edges, ordinates, taper
@@ -17,6 +17,7 @@ from gyrostab.noise import URAD_PER_S
 from gyrostab.simulate import simulate
 
 RATE = 100.0
+WHITE_DENSITY = 1.0 / RATE  # of unit white noise [(deg/h)^2 / Hz]
 
 
 def log_of(
@@ -282,6 +283,39 @@ def test_orders_of_an_uneven_rotation_with_losses_show_one_harmonic_only():
     strong = line_power > 0.01 * line_power.max()
     assert strong.sum() >= 5
     np.testing.assert_allclose(25.0 * line_wave[strong], line_power[strong], rtol=0.3)
+
+
+@pytest.mark.parametrize("harmonic", [0, 1, 2])
+def test_noise_near_orders_is_measured_without_bias_in_bursts_of_losses(turning_noise, harmonic):
+    level = turning_noise["order_level"].values[0, :, harmonic]
+    assert np.isfinite(level).mean() > 0.9
+    assert np.nanmean(level) == pytest.approx(WHITE_DENSITY, rel=0.08)
+
+
+def test_power_of_an_order_itself_is_not_noise_next_to_it(turning_noise):
+    expected = np.full(turning_noise["order_level"].shape, 3.0 * WHITE_DENSITY)
+    noise = noise_at_orders(turning_noise, expected)
+    np.testing.assert_allclose(noise.mean(axis=1), WHITE_DENSITY, rtol=0.08)
+    rising = expected * np.linspace(0.5, 1.5, expected.shape[1])[:, None]
+    np.testing.assert_allclose(
+        noise_at_orders(turning_noise, rising)[0, -1]
+        / noise_at_orders(turning_noise, rising)[0, 0],
+        3.0,
+    )
+
+
+@pytest.fixture(scope="module")
+def turning_noise() -> xr.Dataset:
+    """White noise of a tool that turns with stick-slip, with bursts of losses."""
+    size, length = 480_000, 2_000
+    rng, time = np.random.default_rng(5), np.arange(size) / RATE
+    speed = 360.0 * (1.0 + 0.6 * np.sin(0.6 * np.pi * time))  # deg/s
+    x = rng.standard_normal(size)
+    for first in range(0, size, length):
+        start = first + int(rng.integers(0, 1_400))
+        x[start : start + 500] = np.nan
+    channels = {"rotation_rate": (speed, "deg/s")}
+    return reduce_log(log_of(x, channels=channels), block="20s")
 
 
 def test_orders_use_a_slower_rotation_sensor_and_are_missing_at_rest():
