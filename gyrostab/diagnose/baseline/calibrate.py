@@ -163,6 +163,31 @@ def calibrate_noise(
     return assemble_baseline(blocks, posteriors, quiet=chosen, attrs=attrs, settings=settings)
 
 
+def calibrate_on_known(
+    blocks: xr.Dataset,
+    baseline: xr.Dataset,
+    known: NDArray[np.bool_],
+    *,
+    settings: Settings = DEFAULTS,
+) -> xr.Dataset:
+    """Calibrate the noise again on those quiescent blocks of a baseline that are known (block,).
+
+    A baseline that is not that of `calibrate_noise` is returned as it is, and so is one of which
+    too few blocks are known.
+    """
+    chosen = baseline["quiet"].values & known
+    if (
+        baseline.attrs.get("source") != "calibrated"
+        or "recalibrated" in baseline.attrs
+        or chosen.sum(axis=1).min() < settings.min_quiescent_blocks
+    ):
+        return baseline
+    posteriors = calibrate_axes(blocks, chosen, settings)
+    return assemble_baseline(
+        blocks, posteriors, quiet=chosen, attrs=baseline.attrs, settings=settings
+    )
+
+
 def calibrate_axes(
     blocks: xr.Dataset, chosen: NDArray[np.bool_], settings: Settings
 ) -> list[Posterior]:

@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.baseline.calibrate import calibrate_on_known
 from gyrostab.diagnose.estimate.conditioned_baseline import (
     expected_baseline,
     predict_baseline,
@@ -65,18 +66,28 @@ def measure_evidence(
         identifications.state.settings,
     )
 
+    settings = identifications.state.settings
+    calibrated: dict[bytes, xr.Dataset] = {}  # by the known blocks
+
+    def calibrate(known: NDArray[np.bool_]) -> xr.Dataset:
+        place = known.tobytes()
+        if place not in calibrated:
+            calibrated[place] = calibrate_on_known(blocks, baseline, known, settings=settings)
+        return calibrated[place]
+
+    def before(known: NDArray[np.bool_]) -> xr.Dataset:
+        return expected_baseline(with_course, calibrate(known), known)
+
     def train(
         chosen: Identifications, known: NDArray[np.bool_], is_left_out: Sequence[bool] = ()
     ) -> xr.Dataset:
-        noise = recalibrate(chosen, baseline, first, known)
+        noise = recalibrate(chosen, calibrate(known), first, known)
         renewed = with_noise(chosen, noise)
         left_out = tuple(compress(renewed.identified, is_left_out))
         return predict_baseline(renewed, noise, known, left_out=left_out)
 
-    before = partial(expected_baseline, with_course, baseline)
     after = partial(train, judged) if judged.identified else before
     with_phase_locked = partial(train, with_course) if identified else before
-    settings = identifications.state.settings
     known = select_forecast_start(blocks)
     begun = tuple(
         identification

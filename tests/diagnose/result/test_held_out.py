@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.estimate.joint_fit import fit_identifications
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import held_out as evidence
 from gyrostab.diagnose.result.held_out import cut_stretches, log_likelihood
 from gyrostab.diagnose.result.surfaces import CASES, make_surfaces
 from gyrostab.noise import LAWS
+from gyrostab.simulate import simulate
+from tests.support.candidates import identify_by_hand
 from tests.support.reduced_records import BLOCK_S, RATE, baseline, records
 
 LEVEL = 3600.0 * 0.003**2
@@ -159,6 +164,27 @@ def test_models_are_not_fitted_to_held_out_blocks():
     )  # each block is held out once
     assert forecast[:126].all()
     assert not forecast[126:].any()
+
+
+def test_noise_is_calibrated_without_held_out_blocks(monkeypatch):
+    models = []
+    monkeypatch.setattr(
+        evidence, "held_out", lambda blocks, before, after, **others: models.append((before, after))
+    )
+    model = {"log": {"axes": ["x"]}, "noise": {"N": 0.003, "B": 0.001}}
+    blocks = reduce_log(simulate(model, duration="20min", rate=10.0, seed=1).compute())
+    known = np.arange(blocks.sizes["block"]) % 4 > 0
+    louder = blocks.copy(deep=True)
+    louder["power"][:, ~known] *= 2.0
+    louder["mean"][:, ~known] += 0.05
+    spectra = []
+    for either in (blocks, louder):
+        base = calibrate_noise(either, quiet=(0.0, 1200.0))
+        found = identify_by_hand(either, base, "ageing_bias", "mean", ("slope",))
+        evidence.measure_evidence(either, base, found, fit_identifications(found, base))
+        spectra.append([model(known)["spectrum"].values for model in models.pop()])
+    for of_blocks, of_louder in zip(*spectra, strict=True):
+        np.testing.assert_allclose(of_louder[:, known], of_blocks[:, known], rtol=1e-12)
 
 
 def test_effect_fitted_to_noise_loses():
