@@ -32,7 +32,7 @@ MIN_MEAN_SHARE = 0.1  # of a block that must be present for its mean; design cho
 _MIN_GAP_S = 1.0  # shorter gaps are not listed; design choice
 _AS_MEASURED = (
     "shape", "neighbours", "adjacent", "sub_block_mean", "sub_block_samples", "order",
-    "order_level", "turn_mean", "turn_power", "profile", "profile_samples",
+    "order_samples", "order_level", "turn_mean", "turn_power", "profile", "profile_samples",
 )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -21,8 +21,9 @@ Array = NDArray[np.float64]
 HARMONICS = (1, 2, 3)
 #: Turns per block from an order at which its noise is measured.
 _NEIGHBOURS = np.array([-4, -3, -2, -1, 1, 2, 3, 4])
-#: Variance of an amplitude in the samples that are there, over that of an even rotation, 2 / n.
-#: Design choice: the error assumed is too small by 30 % at most.
+#: Variance of an amplitude in the samples that are there, over that of an even rotation, 2 / n,
+#: from which a block is not fitted, such as one that lost the samples of a turn. Design choice:
+#: half of the samples determine the amplitude.
 _MAX_VARIANCE_RATIO = 2.0
 _MIN_TURNS_APART = 0.9  # turns per block from a line that was removed; just below one DFT bin
 
@@ -76,16 +77,17 @@ class RotationOrders:
         ]
         # a harmonic above half of the sampling rate has the samples of one below
         is_sampled = np.abs(often)[:, None] * HARMONICS < self.length / 2.0
-        order, residual, noise_left = _fit_harmonics(centred, wheels, enough, is_sampled)
+        fit = _fit_harmonics(centred, wheels, enough, is_sampled)
         order_level = []
         with np.errstate(invalid="ignore", divide="ignore"):
             for place, (harmonic, wheel) in enumerate(zip(HARMONICS, wheels, strict=True)):
                 level = _level_near_order(
-                    residual * wheel, noise_left[:, :, place], often, harmonic
+                    fit.residual * wheel, fit.noise_left[:, :, place], often, harmonic
                 )
                 order_level.append(np.where(enough, level / (counts * self.rate), np.nan))
         return {
-            "order": order,
+            "order": fit.amplitudes,
+            "order_samples": fit.samples,
             "order_level": np.stack(order_level, -1),
             "turn_mean": np.stack(turn_mean, -1),
         }
@@ -99,19 +101,28 @@ def _mean_of_present(
     return np.asarray(np.einsum("bs,abs->ab", values, used) / used.sum(axis=-1))
 
 
+class _Harmonics(NamedTuple):
+    """Harmonics of the rotation in each block."""
+
+    amplitudes: NDArray[np.complex128]  # (axis, block, harmonic): NaN where not fitted
+    samples: Array  # (axis, block, harmonic): of an even rotation with the same error
+    residual: Array  # (axis, block, sample): values less the harmonics; zero where missing
+    #: (axis, block, harmonic, neighbour): share of white noise in the residual at `_NEIGHBOURS`
+    noise_left: Array
+
+
 def _fit_harmonics(
     values: Array,
     wheels: Sequence[NDArray[np.complex128]],
     enough: NDArray[np.bool_],
     is_sampled: NDArray[np.bool_],
-) -> tuple[NDArray[np.complex128], Array, Array]:
+) -> _Harmonics:
     """Fit a constant and harmonics to the samples of each block by least squares.
 
     Where the rotation is uneven, as in stick-slip, or samples are missing, harmonics are not
-    orthogonal: products with each of them would show the first one in all. The errors used later
-    are those of an even rotation. Stick-slip of 0.6 once per turn has 1.2 times their variance, of
-    0.9 up to 1.4 times. Blocks with more than `_MAX_VARIANCE_RATIO` times it are not fitted, such
-    as those whose samples from a turn were lost.
+    orthogonal: products with each of them would show the first one in all. The variance of an
+    amplitude is then larger than with an even rotation: 1.2 times with stick-slip of 0.6 once per
+    turn, up to 1.4 times with 0.9.
 
     Parameters
     ----------
@@ -123,18 +134,10 @@ def _fit_harmonics(
         Blocks to fit.
     is_sampled : ndarray of bool, shape (block, harmonic)
         Harmonics to fit.
-
-    Returns
-    -------
-    amplitudes : ndarray, shape (axis, block, harmonic)
-        Complex; NaN where not fitted.
-    residual : ndarray, shape (axis, block, sample)
-        Values less the harmonics; zero where samples are missing.
-    noise_left : ndarray, shape (axis, block, harmonic, neighbour)
-        Share of white noise that the residual has at the `_NEIGHBOURS` of each harmonic.
     """
     basis = np.stack([part for wheel in wheels for part in (wheel.real, -wheel.imag)], axis=-1)
     amplitudes = np.full((*enough.shape, len(wheels)), np.nan + 0j)
+    samples = np.zeros(amplitudes.shape)
     residual, noise_left = values.copy(), np.ones((*amplitudes.shape, _NEIGHBOURS.size))
     size = values.shape[-1]
     away = np.exp(-2j * math.pi * np.arange(size)[:, None] * _NEIGHBOURS / size)
@@ -150,11 +153,12 @@ def _fit_harmonics(
             continue
         sizes = (inverse @ (left.T @ values[axis, block, present]))[:-1]
         amplitudes[axis, block, fitted] = sizes[::2] - 1j * sizes[1::2]
+        samples[axis, block, fitted] = 4.0 / (variance[::2] + variance[1::2])
         residual[axis, block, present] -= columns @ sizes
         for place, wheel in enumerate(wheels):
             fitted_part = left.T @ (wheel[block, present, None] * away[present])
             noise_left[axis, block, place] -= (np.abs(fitted_part) ** 2).sum(axis=0) / len(columns)
-    return amplitudes, residual, noise_left
+    return _Harmonics(amplitudes, samples, residual, noise_left)
 
 
 def make_rotation_orders(log: xr.Dataset, length: int, rate: float) -> RotationOrders | None:

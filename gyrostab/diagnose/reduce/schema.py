@@ -125,6 +125,9 @@ BLOCK_STATISTICS: dict[str, Variable] = {
         _RATE,
         "complex amplitude at multiples of the rotation, NaN below one turn per block",
     ),
+    "order_samples": Variable(
+        _HARMONIC, "1", "samples of an even rotation that determine the amplitude as well"
+    ),
     "order_level": Variable(
         _HARMONIC,
         _POWER,

@@ -55,7 +55,7 @@ class RotationOrder(Statistic):
             return {}
         blocks, expected = draw.blocks, draw.expected
         rate = float(blocks.attrs["sampling_rate_hz"])
-        samples = np.maximum(blocks["samples"].values, 1)
+        samples = np.maximum(blocks["order_samples"].values, 1.0)
         turning = turns_per_second(blocks)
         bands = np.log(blocks["frequency"].values)
         density = np.empty((len(expected), *blocks["order"].shape))
@@ -68,7 +68,7 @@ class RotationOrder(Statistic):
                 :, :, block, low + 1
             ] * (at - low)
         noise = draw.rng.standard_normal((*density.shape, 2)) @ np.array([1.0, 1j])
-        variance = 2.0 * noise_at_orders(blocks, density) * rate / samples[..., None]
+        variance = 2.0 * noise_at_orders(blocks, density) * rate / samples
         return {"order": np.sqrt(variance) * noise}
 
     def design(self, case: Prospect) -> Iterator[Variant]:
@@ -210,7 +210,7 @@ def order_weight(state: State) -> Array:
         state.weight, np.broadcast_to(nearest, (state.weight.shape[0], *nearest.shape)), axis=2
     )
     level = noise_at_orders(blocks, level)
-    seconds = blocks["samples"].values[..., None] / rate
+    seconds = blocks["order_samples"].values / rate
     return np.where(good, seconds / (2.0 * level), 0.0)
 
 
@@ -278,7 +278,7 @@ def turns_per_second(blocks: xr.Dataset) -> Array:
 def score_orders(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
     """Return score, ratio and amplitude of the coherent sum by (record), axis, window, harmonic."""
     order = blocks["order"].values
-    samples = blocks["samples"].values
+    samples = blocks["order_samples"].values
     rate = float(blocks.attrs["sampling_rate_hz"])
     turning, spectrum = turns_per_second(blocks), baseline["spectrum"].values
     bands = np.log(baseline["frequency"].values)
@@ -297,7 +297,7 @@ def score_orders(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> 
             )
         density = noise_at_orders(blocks, density)
         # Of |order|^2: two parts of 2 S rate / n each.
-        variance = 4.0 * density * rate / samples[..., None]
+        variance = 4.0 * density * rate / samples
         present = (
             np.isfinite(order)
             & np.isfinite(variance)

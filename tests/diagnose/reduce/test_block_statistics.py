@@ -292,6 +292,15 @@ def test_noise_near_orders_is_measured_without_bias_in_bursts_of_losses(turning_
     assert np.nanmean(level) == pytest.approx(WHITE_DENSITY, rel=0.08)
 
 
+def test_amplitudes_at_orders_have_the_error_of_so_many_samples():
+    blocks = reduce_turning_noise(turns_per_stick=1.0, swing=0.9)
+    order, samples = (blocks[name].values for name in ("order", "order_samples"))
+    assert np.nanmean(np.abs(order) ** 2 * samples / 4.0) == pytest.approx(1.0, abs=0.07)
+    present = blocks["samples"].values[..., None]
+    assert 1.15 < np.mean(present / samples) < 1.5
+    assert (samples <= present).all()
+
+
 def test_power_of_an_order_itself_is_not_noise_next_to_it(turning_noise):
     expected = np.full(turning_noise["order_level"].shape, 3.0 * WHITE_DENSITY)
     noise = noise_at_orders(turning_noise, expected)
@@ -306,10 +315,14 @@ def test_power_of_an_order_itself_is_not_noise_next_to_it(turning_noise):
 
 @pytest.fixture(scope="module")
 def turning_noise() -> xr.Dataset:
-    """White noise of a tool that turns with stick-slip, with bursts of losses."""
+    return reduce_turning_noise(turns_per_stick=3.3, swing=0.6)
+
+
+def reduce_turning_noise(*, turns_per_stick: float, swing: float) -> xr.Dataset:
+    """Reduce white noise of a tool that turns once a second with stick-slip, with losses."""
     size, length = 480_000, 2_000
     rng, time = np.random.default_rng(5), np.arange(size) / RATE
-    speed = 360.0 * (1.0 + 0.6 * np.sin(0.6 * np.pi * time))  # deg/s
+    speed = 360.0 * (1.0 + swing * np.sin(2.0 * np.pi / turns_per_stick * time))  # deg/s
     x = rng.standard_normal(size)
     for first in range(0, size, length):
         start = first + int(rng.integers(0, 1_400))

@@ -267,6 +267,7 @@ def test_phase_locked_rates_are_detected(base):
     )
     profile = np.sqrt(LEVEL * RATE / 50.0) * rng.normal(size=(40, 3, block_count, 40))
     blocks["order"] = (("record", "axis", "block", "harmonic"), order)
+    blocks["order_samples"] = (("axis", "block", "harmonic"), np.full(order.shape[1:], samples))
     blocks["profile"] = (("record", "axis", "block", "phase"), profile)
     blocks["profile_samples"] = (("axis", "block", "phase"), np.full((3, block_count, 40), 50))
     blocks["channel_rotation_rate"] = ("block", np.full(block_count, 720.0))
