@@ -84,7 +84,8 @@ class RotationOrders:
                 level = _level_near_order(
                     fit.residual * wheel, fit.noise_left[:, :, place], often, harmonic
                 )
-                order_level.append(np.where(enough, level / (counts * self.rate), np.nan))
+                fitted = fit.samples[..., place] > 0.0  # elsewhere the residual has the harmonic
+                order_level.append(np.where(fitted, level / (counts * self.rate), np.nan))
         return {
             "order": fit.amplitudes,
             "order_samples": fit.samples,
