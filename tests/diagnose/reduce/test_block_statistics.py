@@ -292,6 +292,17 @@ def test_noise_near_orders_is_measured_without_bias_in_bursts_of_losses(turning_
     assert np.nanmean(level) == pytest.approx(WHITE_DENSITY, rel=0.08)
 
 
+def test_blocks_without_part_of_each_turn_have_neither_amplitude_nor_noise_next_to_it():
+    time = np.arange(48_000) / RATE
+    x = 5.0 * np.cos(2.0 * np.pi * time) + np.random.default_rng(1).standard_normal(time.size)
+    x[(time // 20.0 == 3) & (time % 1.0 > 0.4)] = np.nan
+    channels = {"rotation_rate": (np.full(time.size, 360.0), "deg/s")}
+    blocks = reduce_log(log_of(x, channels=channels), block="20s")
+    lost = np.arange(24) == 3
+    for name in ("order", "order_level"):
+        np.testing.assert_array_equal(np.isnan(blocks[name].values[0, :, 0]), lost)
+
+
 def test_amplitudes_at_orders_have_the_error_of_so_many_samples():
     blocks = reduce_turning_noise(turns_per_stick=1.0, swing=0.9)
     order, samples = (blocks[name].values for name in ("order", "order_samples"))
