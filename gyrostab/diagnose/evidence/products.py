@@ -24,7 +24,7 @@ WIDTHS = (1.0, 10.0, 100.0, 1000.0)
 #: A design that keeps a smaller share of its square, after constants and given columns are
 #: projected out, counts as absent. Above rounding errors.
 _MIN_SQUARE_SHARE = 1e-9
-_MAX_PRODUCTS_AT_ONCE = 10_000  # designs times records times grid points; limits memory
+_MAX_PRODUCTS_AT_ONCE = 100_000  # designs times records times grid points; limits memory
 
 
 class Products(NamedTuple):
