@@ -29,6 +29,9 @@ _SPLINE_KNOTS = 12  # of hat functions over the record; design choice
 _MAX_DESIGN_DIFFERENCE = 1e-3  # of its size, up to which designs are equal; design choice
 _MAX_TIMES = 240  # limits time
 _MAX_STEPS = 20  # largest steps of the means among them: a step one block off does not fit
+#: Restarts among them. Limits the time of a design with a step at each restart, which grows with
+#: the cube of their number.
+_MAX_RESTARTS = 60
 _SIDE_BLOCKS = (2, 8, 32)  # blocks on either side that define a step; design choice
 
 
@@ -226,8 +229,11 @@ def distinct_variants(variants: list[Variant]) -> tuple[Variant, ...]:
 
 
 def power_on_times(windows: Windows) -> Array:
-    """Return the times at which power came back [s]."""
-    return np.asarray(windows.restarts[:, 1] if windows.restarts.size else np.empty(0))
+    """Return the times at which power came back [s], after the longest power-offs if many."""
+    if not windows.restarts.size:
+        return np.empty(0)
+    longest = np.argsort(-np.diff(windows.restarts)[:, 0], kind="stable")[:_MAX_RESTARTS]
+    return np.asarray(np.sort(windows.restarts[longest, 1]))
 
 
 def select_step_times(values: Array, windows: Windows) -> list[float]:

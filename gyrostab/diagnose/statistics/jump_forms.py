@@ -96,8 +96,8 @@ def restart_competitors(component: Component, state: State) -> Iterator[Competit
     """
     if component.candidate.effect != _JUMP or len(component.variant.columns) < 2:
         return
-    block, restarts = float(state.blocks.attrs["block_s"]), state.blocks["restart_end"].values
-    block_count = state.blocks.sizes["block"]
+    block, block_count = float(state.blocks.attrs["block_s"]), state.blocks.sizes["block"]
+    restarts = block * (1.0 - component.variant.design[:, 0]).sum(axis=1)
     edges = np.concatenate([[0.0], (restarts[1:] + restarts[:-1]) / 2.0, [block_count * block]])
     time = (np.arange(block_count) + 0.5) * block
     courses = np.clip((time - edges[:-1, None]) / np.diff(edges)[:, None], 0.0, 1.0)

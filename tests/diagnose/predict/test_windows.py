@@ -11,7 +11,11 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
-from gyrostab.diagnose.predict.windows import predict_effect, select_step_times
+from gyrostab.diagnose.predict.windows import (
+    power_on_times,
+    predict_effect,
+    select_step_times,
+)
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.physics.prediction import Windows
@@ -73,6 +77,25 @@ def test_a_large_jump_is_found_anywhere_in_a_long_record(at):
     tried = np.array(select_step_times(possible, frame))
     assert tried.size < 350
     assert np.abs(tried - at).min() <= 5.0
+
+
+def test_of_many_restarts_the_longest_are_tried(restarted):
+    rng = np.random.default_rng(5)
+    back = np.sort(rng.choice(np.arange(20.0, 3_580.0, 5.0), 400, replace=False))
+    off = rng.uniform(5.0, 60.0, back.size)
+    frame = Windows(
+        20.0 * np.arange(180),
+        20.0 * np.arange(1, 181),
+        np.ones(1),
+        10.0,
+        ("x",),
+        restarts=np.stack([back - off, back], axis=1),
+    )
+    longest = power_on_times(frame)
+    assert longest.tolist() == sorted(back[np.argsort(-off)[:60]])
+    tried = select_step_times(np.unique([*back, *frame.begin[1:]]), frame)
+    assert len(tried) < 350
+    assert set(longest) <= set(tried)
 
 
 def test_two_restarts_share_their_probability(restarted):
