@@ -122,7 +122,8 @@ def choose_window(log: xr.Dataset) -> str:
 
 def select_axes(log: Data, axis: str | Sequence[str]) -> Data:
     """Return a log, or its signal, with these axes only."""
-    axes = [axis] if isinstance(axis, str) or not np.iterable(axis) else list(dict.fromkeys(axis))
+    labels = [axis] if isinstance(axis, str) or not np.iterable(axis) else axis
+    axes = list(dict.fromkeys(str(np.asarray(label)) for label in labels))
     available = [str(name) for name in log["axis"].values]
     unknown = [name for name in axes if name not in available]
     if unknown or not axes:

@@ -22,7 +22,7 @@ from gyrostab.errors import (
 )
 from gyrostab.ingest.dataframe import from_dataframe, keyword_advice, warn_notes
 from gyrostab.ingest.uniform import advise_dates, as_uniform
-from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS
+from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS, name_axes
 from gyrostab.store.lazy import hide_infinite
 from gyrostab.store.private import is_in_memory
 from gyrostab.store.read import MIN_LAZY_VALUES, make_variable_lazy
@@ -204,16 +204,7 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
     if unit.quantity == "rate" and kind == "angle":
         raise OptionError(f"kind='angle', but {unit.text!r} is a unit of rates; leave kind out")
     name = "angle" if unit.quantity == "angle" and not increments else "rate"
-    axes = (
-        [str(axis) for axis in np.atleast_1d(da["axis"].values)]
-        if "axis" in da.coords
-        else list("xyz"[: da.sizes.get("axis", 1)])
-    )
-    if len(axes) < da.sizes.get("axis", 1):
-        raise SchemaError(
-            f"the DataArray has {da.sizes['axis']} axes without names; give them: "
-            "da.assign_coords(axis=[...])"
-        )
+    axes = name_axes(da)
     array = da if "axis" in da.dims else da.drop_vars("axis", errors="ignore").expand_dims("axis")
     signal = array.variable.transpose("axis", "time")
     values = hide_infinite(signal.data)

@@ -11,7 +11,7 @@ import xarray as xr
 
 from gyrostab.errors import SchemaError
 from gyrostab.noise import TERMS
-from gyrostab.schema.variables import SIGNAL_UNITS, VARIABLES
+from gyrostab.schema.variables import RESERVED_NAMES, SIGNAL_UNITS, VARIABLES
 
 #: What tau may differ from a whole number of samples, as a share: the rounding of stored numbers,
 #: far below a sample in any window.
@@ -51,6 +51,32 @@ def texts(dataset: xr.Dataset, name: str) -> list[str]:
     """
     held = dataset.attrs.get(name, ())
     return [held] if isinstance(held, str) else [str(text) for text in held]
+
+
+def name_axes(signal: Any) -> list[str]:
+    """Return the names of the axes of a log or a signal, whatever the type of its labels.
+
+    Up to three axes without labels are x, y and z.
+
+    Raises
+    ------
+    SchemaError
+        When more axes have no labels.
+
+    Examples
+    --------
+    >>> name_axes(xr.Dataset(coords={"axis": [0, 1]})), name_axes(xr.DataArray(np.zeros(100)))
+    (['0', '1'], ['x'])
+    """
+    if "axis" in signal.coords:
+        labels = np.atleast_1d(signal["axis"].values)
+        return [label.decode() if isinstance(label, bytes) else str(label) for label in labels]
+    count = signal.sizes.get("axis", 1)
+    if count > len("xyz"):
+        raise SchemaError(
+            f"there are {count} axes without names; give them: .assign_coords(axis=[...])"
+        )
+    return list("xyz"[:count])
 
 
 def log_channels(log: xr.Dataset) -> list[str]:
@@ -156,9 +182,19 @@ def check_log(log: xr.Dataset, *, rate: bool = True) -> None:
     name = signal_name(log)
     _require_variables(log, "log", {name: ("axis", "time"), "time": ("time",)})
     _check_units(log, name)
+    if (kind := log.variables[name].dtype).kind not in "biuf":
+        raise SchemaError(
+            f"variable {name!r} holds values of type {kind}; give real numbers, and NaN where one "
+            f"is missing: log.assign({name}=log.{name}.astype(float))"
+        )
+    if reserved := sorted(RESERVED_NAMES.intersection(log_channels(log))):
+        raise SchemaError(
+            f"channel {reserved[0]!r}: variables of gyrostab have this name; choose another one: "
+            f"log.rename({reserved[0]}='{reserved[0]}_channel')"
+        )
     if log.sizes["axis"] == 0 or log.sizes["time"] == 0:
         raise SchemaError("the log is empty: it has no axis or no sample")
-    names = [str(axis) for axis in log["axis"].values]
+    names = name_axes(log)
     if len(set(names)) < len(names):
         raise SchemaError(
             f"the axes {', '.join(map(repr, names))} have names in common; rename them with "

@@ -181,6 +181,11 @@ ORDER = {
     "one sample": lambda log: log.isel(time=[5]),
     "no sample": lambda log: log.isel(time=slice(0, 0)),
     "rows as read": lambda log: log.drop_vars("time").rename_dims(time="row"),
+    "complex numbers": lambda log: log.assign(rate=log.rate.astype(complex)),
+    "text": lambda log: log.assign(rate=log.rate.astype(str)),
+    "objects": lambda log: log.assign(rate=log.rate.astype(object)),
+    "dates": lambda log: log.assign(rate=log.rate.astype("M8[ns]")),
+    "a channel called like a variable of the product": lambda log: log.rename(temperature="count"),
 }
 
 
@@ -219,7 +224,19 @@ def test_gap_between_two_pieces_is_missing(explicit):
     check_against(whole, x, rate=RATE)
 
 
+INFINITE = np.random.default_rng(2).random((2, SIZE)) < 0.02
 KEEPS = {
+    "axes by number": (lambda log: log.assign_coords(axis=[0, 1]), lambda x: x),
+    "axes by bytes": (lambda log: log.assign_coords(axis=[b"x", b"y"]), lambda x: x),
+    "axes without labels": (lambda log: log.drop_vars("axis"), lambda x: x),
+    "infinite values": (
+        lambda log: log.assign(rate=log.rate.where(~INFINITE, np.inf)),
+        lambda x: np.where(INFINITE, np.nan, x),
+    ),
+    "infinite values in chunks": (
+        lambda log: log.assign(rate=log.rate.chunk(time=700).where(~INFINITE, -np.inf)),
+        lambda x: np.where(INFINITE, np.nan, x),
+    ),
     "a part of the time": (
         lambda log: log.sel(time=slice("2026-03-01T10:00:10", "2026-03-01T10:00:39.99")),
         lambda x: x[:, 1000:4000],
@@ -271,6 +288,35 @@ def test_operations_that_keep_the_rate(name, explicit):
     check_against(
         change(log), truth(x), rate=RATE, rtol=1e-4 if name == "single precision" else 1e-9
     )
+
+
+@pytest.mark.parametrize(
+    ("labels", "names"), [([0, 1], ["0", "1"]), ([b"x", b"y"], ["x", "y"]), (None, ["x", "y"])]
+)
+def test_axes_have_names_whatever_their_labels(labels, names, tmp_path):
+    log = make().drop_vars("axis") if labels is None else make().assign_coords(axis=labels)
+    surface = gyrostab.davar(log, window="8s", axis=names[1])
+    assert surface.axis.values.tolist() == names[1:]
+    product = gyrostab.fit_noise(gyrostab.davar(log, window="8s"))
+    opened = gyrostab.open_product(gyrostab.to_netcdf(product, tmp_path / "product.nc"))
+    assert opened.axis.values.tolist() == names
+    gyrostab.plot_signal(log)
+
+
+def test_infinite_values_are_missing():
+    x = record()
+    finite = make(np.where(INFINITE, np.nan, x))
+    surface, expected = (
+        gyrostab.davar(log, window="8s")
+        for log in (finite.assign(rate=finite.rate.where(~INFINITE, np.inf)), finite)
+    )
+    xr.testing.assert_equal(surface, expected)
+
+
+@pytest.mark.parametrize("axis", [["y"], np.array(["y"]), xr.DataArray(["y"]), {"y": 1}.keys()])
+def test_axes_are_selected_by_any_sequence(axis):
+    assert gyrostab.davar(make(), window="8s", axis=list(axis)).axis.values.tolist() == ["y"]
+    assert gyrostab.davar(make(), window="8s", axis=axis).axis.values.tolist() == ["y"]
 
 
 @pytest.mark.parametrize("keep", [True, False])

@@ -25,8 +25,9 @@ from gyrostab.ingest.gap_table import (
     sort_gaps,
 )
 from gyrostab.ingest.uniform.grid import UniformGrid, find_grid
-from gyrostab.schema import check_log, require_dataset, signal_name, texts
-from gyrostab.store.private import close_function
+from gyrostab.schema import check_log, name_axes, require_dataset, signal_name, texts
+from gyrostab.store.lazy import find_source, hide_infinite
+from gyrostab.store.private import close_function, is_in_memory
 from gyrostab.time.grid import TimeGridIndex, grid_index, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
 
@@ -132,13 +133,16 @@ def advise_dates(times: NDArray[Any], name: str) -> str:
 
 
 def _with_dimensions(log: Any) -> xr.Dataset:
-    """Return the log with its signal on ``(axis, time)``, from another order or a single axis."""
+    """Return the log with its signal on ``(axis, time)``, from another order or a single axis.
+
+    Axes have names, and infinite values become NaN.
+    """
     require_dataset(log, "log")
     if "row" in log.dims:
         raise SchemaError(
             "these are raw rows with their stamps as written; call gyrostab.regularise(raw) first"
         )
-    name = signal_name(log)
+    name, names = signal_name(log), name_axes(log)
     dims = log.variables[name].dims
     if dims == ("time",):
         if "axis" not in log.variables:
@@ -147,6 +151,13 @@ def _with_dimensions(log: Any) -> xr.Dataset:
             log = log.assign({name: log[name].expand_dims("axis")})
     elif dims == ("time", "axis"):
         log = log.assign({name: log.variables[name].transpose("axis", "time")})
+    if "axis" in log.dims and names != log["axis"].values.tolist():
+        log = log.assign_coords(axis=("axis", names, log["axis"].attrs))
+    signal = log.variables[name]
+    if is_in_memory(signal) or (signal.chunks is not None and find_source(signal.data) is None):
+        finite = hide_infinite(signal.data)
+        if finite is not signal.data:
+            log = log.assign({name: signal.copy(data=finite)})
     turned: xr.Dataset = log
     return turned
 
