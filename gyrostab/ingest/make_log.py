@@ -34,8 +34,8 @@ def make_log(
     Parameters
     ----------
     values : array_like, shape (time,) or (axis, time)
-        Rotation rate or cumulative angle; NaN marks a missing sample, and infinite values become
-        NaN. numpy or dask, float or integer; of labelled objects, the values only.
+        Rotation rate or cumulative angle; NaN marks a missing sample, and infinite and masked
+        values become NaN. numpy or dask, float or integer; of labelled objects, the values only.
     rate : float
         Sampling rate [Hz].
     unit : str
@@ -70,13 +70,16 @@ def make_log(
     if kind not in SIGNAL_UNITS:
         raise OptionError(f"kind={kind!r}: give 'rate' or 'angle'")
     check_rate(rate, "rate")
+    if not isinstance(unit, str):
+        raise MissingUnitError(f"unit={unit!r}: give the unit of the values, for instance 'deg/s'")
     parsed = parse_unit(unit)
     if parsed.quantity != kind:
         raise OptionError(f"unit {unit!r} is a unit of {parsed.quantity}, but kind is {kind!r}")
     data = _real_numbers(values, "the values")
     packing = declare_counts(data.dtype, parsed.factor) if data.dtype.kind in "iu" else {}
     data = data[None, :] if data.ndim == 1 else data
-    names = list(axis) if axis is not None else list("xyz")[: len(data) if data.ndim else 0]
+    given = "xyz"[: len(data) if data.ndim else 0] if axis is None else axis
+    names = [str(name) for name in given]
     if data.ndim != 2 or len(names) != data.shape[0]:
         raise OptionError(
             f"values of shape {data.shape} do not fit the axes {names}; give values as (axis, "
@@ -103,13 +106,16 @@ def make_log(
 def _real_numbers(values: Any, label: str) -> Any:
     """Return an array, in dask if it is, with NaN in the place of infinite values."""
     try:
-        data = values if isinstance(values, da.Array) else np.asarray(values)
+        is_array = isinstance(values, da.Array | np.ma.MaskedArray)
+        data: Any = values if is_array else np.asarray(values)
     except ValueError as error:  # rows of different lengths
         raise OptionError(f"{label} are not an array: {error}") from error
     if data.dtype.kind not in "biuf":
         raise OptionError(
             f"{label} are of type {data.dtype}; give real numbers, and NaN where one is missing"
         )
+    if hasattr(data, "filled"):  # masked
+        data = data.astype(np.float64).filled(np.nan)
     return hide_infinite(data)
 
 

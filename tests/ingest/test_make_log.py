@@ -74,6 +74,23 @@ def test_bad_input_is_refused_with_advice(change, error, message):
         make_log(options.pop("values"), **options)
 
 
+def test_masked_values_are_missing():
+    masked = np.ma.masked_where(VALUES > 1.0, VALUES)
+    channels = {"temperature": (masked, "degC")}
+    log = make_log(masked, rate=10.0, unit="deg/h", channels=channels)
+    expected = np.where(VALUES > 1.0, np.nan, VALUES)
+    np.testing.assert_array_equal(log.rate.values[0], expected)
+    np.testing.assert_array_equal(log.temperature.values, expected)
+    counts = make_log(np.ma.masked_equal([3, 0, 5], 0), rate=10.0, unit="2 deg/h")
+    np.testing.assert_array_equal(counts.rate.values[0], [6.0, np.nan, 10.0])
+
+
+@pytest.mark.parametrize("unit", [None, 3])
+def test_values_need_a_unit(unit):
+    with pytest.raises(MissingUnitError, match=r"unit=.*for instance 'deg/s'"):
+        make_log(VALUES, rate=10.0, unit=unit)
+
+
 def test_channels_have_the_units_of_channels_of_files():
     given = {"rotation_rate": "rpm", "toolface": "rad", "temperature_case": "V", "ramp": "V"}
     channels = {name: (np.ones(50), unit) for name, unit in given.items()}
