@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.errors import OptionError, SchemaError
+from gyrostab.errors import FormatError, OptionError, SchemaError
 from gyrostab.schema import check_product
 from tests.support import synthetic
 
@@ -98,6 +98,40 @@ def test_figures_of_a_selected_axis(product: xr.Dataset, draw: Callable[..., Any
 def test_the_interval_of_a_selected_axis(product: xr.Dataset) -> None:
     interval = gyrostab.confidence_interval(product.sel(axis="y"))
     xr.testing.assert_equal(interval, gyrostab.confidence_interval(product).sel(axis=["y"]))
+
+
+def test_a_selected_axis_is_fitted_correlated_and_stored(
+    product: xr.Dataset, tmp_path: Path
+) -> None:
+    single, listed = product.sel(axis="y"), product.sel(axis=["y"])
+    for function in (gyrostab.fit_noise, gyrostab.correlate):
+        xr.testing.assert_identical(function(single), function(listed))
+    paths = (
+        gyrostab.to_netcdf(single, tmp_path / "single.nc"),
+        gyrostab.to_zarr(single, tmp_path / "single.zarr"),
+    )
+    for path in paths:
+        xr.testing.assert_equal(gyrostab.open_product(path).load(), listed)
+
+
+def test_a_single_window_is_stored_and_refused_as_a_product(
+    product: xr.Dataset, tmp_path: Path
+) -> None:
+    path = gyrostab.to_netcdf(product.isel(time=3), tmp_path / "window.nc")
+    with xr.open_dataset(path) as opened:
+        assert opened.time.values == product.time.values[3]
+        assert opened.attrs["time_coverage_start"] == opened.attrs["time_coverage_end"]
+    with pytest.raises(FormatError, match=r"keep the dimension 'time'"):
+        gyrostab.open_product(path)
+
+
+def test_a_stored_product_with_a_fault_is_refused_with_its_reason(
+    product: xr.Dataset, tmp_path: Path
+) -> None:
+    joined = product.assign(fit_tau_min=product.N.drop_attrs())
+    path = gyrostab.to_netcdf(joined, tmp_path / "joined.nc")
+    with pytest.raises(FormatError, match=r"concatenated along 'time'.*data_vars='minimal'"):
+        gyrostab.open_product(path)
 
 
 def test_an_allan_deviation_of_several_axes_needs_one(product: xr.Dataset) -> None:

@@ -15,7 +15,7 @@ from gyrostab.allan.fit_inputs import FIT_VARIABLES, check_options, prepare_fit,
 from gyrostab.allan.window_fit import fit_block
 from gyrostab.kernels.fit.covariance import STOCHASTIC
 from gyrostab.noise import TERMS
-from gyrostab.schema import attributes
+from gyrostab.schema import attributes, with_axis
 
 #: Band limit of each axis, by its name.
 Bands = Mapping[str, tuple[float, ...]]
@@ -182,6 +182,7 @@ def _fit_checked(
     immediate: bool = False,
     bands: Bands | None = None,
 ) -> xr.Dataset:
+    surface = with_axis(surface)
     fitted_terms, chosen = check_options(surface, terms, tau_min, tau_max)
     if bands is None:
         bands = find_bands(surface, terms=fitted_terms, tau_min=tau_min, tau_max=tau_max)

@@ -63,7 +63,7 @@ def check_fit_options(
     >>> check_fit_options("NB", tau_min="1min")
     (['N', 'B'], 60.0, inf)
     """
-    fitted_terms = list(dict.fromkeys(terms))
+    fitted_terms = list(dict.fromkeys(terms if np.iterable(terms) else [terms]))
     unknown = [term for term in fitted_terms if term not in TERMS]
     if unknown or not fitted_terms:
         raise OptionError(f"terms {unknown or fitted_terms}: choose among {', '.join(TERMS)}")

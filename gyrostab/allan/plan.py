@@ -48,7 +48,7 @@ def make_plan(
     variance: str = "avar",
 ) -> Plan:  # fmt: skip
     """Check the options of `davar` against a log of `gyrostab.ingest.convert.as_log`."""
-    if variance not in VARIANCES:
+    if not isinstance(variance, str) or variance not in VARIANCES:
         raise OptionError(f"variance={variance!r}: give one of {', '.join(VARIANCES)}")
     # with min_strict above 1, all cells are of cluster means
     for option, share, most in (

@@ -24,7 +24,7 @@ from gyrostab.correlate.fit import (
 from gyrostab.correlate.judge import VERDICTS, describe_coupling, slope_label
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import TERMS
-from gyrostab.schema import OBSERVED, check_product
+from gyrostab.schema import OBSERVED, check_product, with_axis
 from gyrostab.time.durations import duration_seconds
 
 Array = NDArray[np.float64]
@@ -94,11 +94,12 @@ def correlate(
     >>> result = gyrostab.correlate(product, max_lag="2h")           # doctest: +SKIP
     >>> result["window_mean_per_temperature"].sel(axis="x")          # doctest: +SKIP
     """
+    product = with_axis(product)
     check_product(product)
     _check_windows(product)
-    if not 0.5 <= level < 1.0:
+    if not (isinstance(level, int | float) and 0.5 <= level < 1.0):
         raise OptionError(
-            f"level {level:g}: the level of an interval lies between 0.5 and 1, for instance 0.95"
+            f"level {level!r}: the level of an interval lies between 0.5 and 1, for instance 0.95"
         )
     names = _select_variables(product, variables)
     time = (product["time"].values - product["time"].values[0]) / np.timedelta64(1, "s")
@@ -178,7 +179,10 @@ def _select_variables(product: xr.Dataset, variables: str | Sequence[str] | None
             term for term in TERMS if bool((product["observable"].sel(term=term) == OBSERVED).any())
         ]
         return ["window_mean", *observed]
-    names = [variables] if isinstance(variables, str) else list(variables)
+    is_single = isinstance(variables, str) or not np.iterable(variables)
+    names: list[Any] = [variables] if is_single else list(variables)
+    if not names:
+        raise OptionError("give at least one variable, for instance window_mean")
     for name in names:
         if name not in product or product[name].dims != ("axis", "time"):
             raise OptionError(

@@ -109,7 +109,7 @@ def make_global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[st
     if times is not None and times.dtype.kind == "M" and times.size:
         for end, position in (("start", 0), ("end", -1)):
             # one dimension when the axis is computed
-            stamp = np.asarray(times[position].values).ravel()[0]
+            stamp = np.asarray((times[position] if times.ndim else times).values).ravel()[0]
             attrs[f"time_coverage_{end}"] = f"{stamp.astype('datetime64[us]')}Z"
     return encode_attributes(attrs)
 

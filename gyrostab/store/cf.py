@@ -24,6 +24,7 @@ from gyrostab.schema import (
     check_log,
     check_product,
     check_surface,
+    with_axis,
 )
 from gyrostab.store.attributes import (
     decode_attributes,
@@ -75,7 +76,8 @@ def to_disk(
     With `stamps`, a computed time axis becomes a lazy coordinate, with its rule as an attribute.
     With `nanoseconds`, times are not stored as microseconds, even if that would be exact.
     """
-    kind = find_kind(dataset)
+    if (kind := find_kind(whole := with_axis(dataset))) != "dataset":
+        dataset = whole  # also of one axis that was selected
     dataset = make_names_storable(dataset)
     grids = find_time_grids(dataset)
     short = not nanoseconds and has_whole_microseconds(dataset, grids, stamps=stamps)

@@ -669,6 +669,9 @@ def test_wrong_arguments_are_explained():
     surface = windows_of(np.random.default_rng(16).standard_normal((3, 1000)))
     with pytest.raises(OptionError, match="Q, N, B, K, R"):
         fit_noise(surface, terms="NX")
+    for terms in (None, 3, ["NB"]):
+        with pytest.raises(OptionError, match="Q, N, B, K, R"):
+            fit_noise(surface, terms=terms)
     with pytest.raises(SchemaError, match="avar"):
         fit_noise(surface.drop_vars("avar"))
     with pytest.raises(SchemaError, match="white_response"):

@@ -490,6 +490,13 @@ def test_errors_say_what_to_do():
         gyrostab.correlate(product, max_lag="3D")
     with pytest.raises(OptionError, match="variable 'avar'"):
         gyrostab.correlate(product, variables="avar")
+    with pytest.raises(OptionError, match="variable 3"):
+        gyrostab.correlate(product, variables=3)
+    with pytest.raises(OptionError, match="at least one variable"):
+        gyrostab.correlate(product, variables=[])
+    for level in ("0.9", None, 95):
+        with pytest.raises(OptionError, match=f"level {level!r}: .* between 0.5 and 1"):
+            gyrostab.correlate(product, level=level)
 
 
 @pytest.fixture(scope="module")
