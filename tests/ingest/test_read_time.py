@@ -295,6 +295,23 @@ def test_clock_is_continued_over_batches_and_on_disk(tmp_path, monkeypatch, name
     assert sum("the clock begins again" in note for note in raw.attrs["notes"]) == 1
 
 
+@pytest.mark.parametrize(
+    ("unit", "tick"), [("us", 1e-6), ("s", 1e-6), ("0.1 ms", 1e-4), ("ms", 1e-3)]
+)
+@pytest.mark.parametrize("lowest", [0, -(2**31)])
+def test_clock_of_a_32_bit_counter_is_continued(tmp_path, unit, tick, lowest):
+    count = lowest + 2**32 - round(5 / tick) + np.rint(np.arange(2000) / 100 / tick).astype(int)
+    written = (count - lowest) % 2**32 + lowest
+    path = tmp_path / "log.csv"
+    times = [f"{value * 1e-6:.6f}" if unit == "s" else str(value) for value in written.tolist()]
+    pd.DataFrame({f"time [{unit}]": times, "gyro_x [deg/h]": np.arange(2000.0)}).to_csv(path)
+    log = regularise(read_log(path))
+    assert log.sizes["time"] == 2000
+    np.testing.assert_array_equal(log.rate.values[0], np.arange(2000.0))
+    (note,) = [note for note in log.attrs["notes"] if "the clock begins again" in note]
+    assert f"after {2**32 * tick:.10g} s, when its 32-bit counter is full, (1 time)" in note
+
+
 @pytest.mark.parametrize("first", [0.2, 40.0])
 def test_clock_that_restarts_elsewhere_is_not_continued(tmp_path, first):
     clock = np.concatenate([50_000 + np.arange(100) / 20, first + np.arange(100) / 20])

@@ -24,8 +24,16 @@ from gyrostab.store.lazy import read_slice
 from gyrostab.time.stamps import split_instant, to_nanoseconds
 from gyrostab.units import DAY
 
-#: Periods after which a clock of the time of day, and one of the GPS week, begin again [ns].
-CLOCK_PERIODS = (int(DAY) * 10**9, 7 * int(DAY) * 10**9)
+#: Periods after which clocks begin again [ns], and their names: of the time of day, of the GPS
+#: week, and 32-bit counters of microseconds, of 0.1 ms and of milliseconds.
+CLOCK_PERIODS = {
+    int(DAY) * 10**9: "a day",
+    7 * int(DAY) * 10**9: "a week",
+    **{
+        2**32 * tick: f"{2**32 * tick / 1e9:.10g} s, when its 32-bit counter is full,"
+        for tick in (10**3, 10**5, 10**6)
+    },
+}
 #: Steps from which the typical one follows.
 _TYPICAL_STEPS = 4096
 #: The integer of ``NaT``.
@@ -243,7 +251,7 @@ class TurningClock:
         rises = steps[:_TYPICAL_STEPS]
         rises = rises[rises > 0]
         typical = float(np.median(rises)) if rises.size else 0.0  # 0 if all stamps are equal
-        backward = np.flatnonzero(steps < -CLOCK_PERIODS[0] // 2) + 1
+        backward = np.flatnonzero(steps < -min(CLOCK_PERIODS) // 2) + 1
         turns = [] if self.last is None else [(0, find_turn(int(good[0]) - self.last, typical))]
         for row in backward.tolist():
             turn = find_turn(int(steps[row - 1]), typical)
@@ -264,7 +272,7 @@ class TurningClock:
         """Return a note if a period was added."""
         if not self.turns:
             return []
-        period = "a day" if max(self.turns) == CLOCK_PERIODS[0] else "a week"
+        period = CLOCK_PERIODS[max(self.turns)]
         times = f"{len(self.turns)} time{'s' * (len(self.turns) > 1)}"
         return [
             f"the clock begins again after {period} ({times}) "
