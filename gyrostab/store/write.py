@@ -115,6 +115,18 @@ def declare_counts(dtype: Any, scale: float) -> dict[str, Any]:
     return {"dtype": signed, "scale_factor": float(scale), "_FillValue": fill}
 
 
+def pack_counts(reach: float, scale: float) -> dict[str, Any]:
+    """Return the encoding of integer counts up to `reach`; empty if they exceed 32 bits.
+
+    Examples
+    --------
+    >>> pack_counts(40_000, 0.1)["dtype"], pack_counts(1e10, 0.1)
+    (dtype('int32'), {})
+    """
+    dtype = next((kind for kind in ("int16", "int32") if reach < np.iinfo(kind).max), None)
+    return declare_counts(dtype, scale) if dtype else {}
+
+
 def common_packing(encodings: Iterable[Mapping[Any, Any]]) -> dict[str, Any]:
     """Find the encoding of a variable of concatenated logs: counts if all are counts of one factor.
 

@@ -18,7 +18,7 @@ from gyrostab.ingest.columns.stamps import NAT, TurningClock
 from gyrostab.ingest.options import FileSummary
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import Converted, make_dask, read_slice, stack_rows
-from gyrostab.store.write import declare_counts
+from gyrostab.store.write import pack_counts
 
 #: Largest number of bad places that a note lists.
 MAX_NAMED_PLACES = 10
@@ -150,8 +150,7 @@ class RawLogBuilder:
         if None in spans or len(factors) != 1 or any(column.offset != 0.0 for column in columns):
             return {}
         reach = max(max(-low, high) for low, high in filter(None, spans))
-        dtype = next((kind for kind in ("int16", "int32") if reach < np.iinfo(kind).max), None)
-        return declare_counts(dtype, factors.pop()) if dtype else {}
+        return pack_counts(reach, factors.pop())
 
     def finish(self, notes: Sequence[str] = ()) -> xr.Dataset:
         """Return the raw log; `FormatError` if more than half of the rows are unreadable."""

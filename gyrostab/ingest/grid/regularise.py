@@ -1,7 +1,7 @@
 """Regularise raw rows: uniform time, NaN at every missing sample, a table of gaps.
 
 No value is ever interpolated, averaged or moved by a fraction of a sample: a sample is a row of the
-file, bit for bit, or NaN.
+file, bit for bit, or NaN. Only cumulative angles that begin again get whole turns.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from gyrostab.ingest.concat.core import concatenate_logs
 from gyrostab.ingest.concat.grid import split_axes
 from gyrostab.ingest.concat.lazy import place_array
 from gyrostab.ingest.gap_table import gap_variables, name_lost, sort_gaps
+from gyrostab.ingest.grid.angles import continue_angles
 from gyrostab.ingest.grid.gaps import find_gaps
 from gyrostab.ingest.grid.notes import describe_angles, describe_channels, describe_placement
 from gyrostab.ingest.grid.place import Placement, check_grid
@@ -205,6 +206,9 @@ def regularise(
     gap_limit = duration_seconds(max_gap, "max_gap")
     name = signal_name(raw)
     allowed = check_limits(limits)
+    turns: list[str] = []
+    if name == "angle" and raw.attrs.get("kind") == "angle":
+        raw, turns = continue_angles(raw)
     scanned = scan_rows(raw, name)
     given = rate if rate is not None else raw.attrs.get("declared_rate_hz")
     declared = None if given is None else float(given)
@@ -218,7 +222,7 @@ def regularise(
     )
     notes += describe_placement(raw, scanned, placement, table, hertz)
     if name == "angle" and raw.attrs.get("kind") == "angle":
-        notes += describe_angles(raw)
+        notes += [*turns, *describe_angles(raw)]
 
     increments = raw.attrs.get("kind") == "increment"
     signal = "rate" if increments else name

@@ -1,0 +1,152 @@
+"""Continue cumulative angles where they wrap around, or where their counter begins again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.ingest.columns.stamps import read_stamps
+from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, file_of
+from gyrostab.store.lazy import RowSource, make_dask, read_into, read_slice
+from gyrostab.store.write import pack_counts
+
+#: A circle [degree], and the counts of counters of 16, 24 and 32 bits.
+_CIRCLE, _COUNTERS = 360.0, (2**16, 2**24, 2**32)
+#: Longest step, in usual steps, from the angle at which a wrapped angle or a counter begins again.
+_REACH = 5.0
+#: Shortest period of a counter [usual steps]: noise of the angle has no such steps.
+_MIN_PERIOD = 16.0
+#: Shortest step that is a jump [usual steps], and the longest time between two rows over which a
+#: counter that was set to zero is continued [usual times].
+_MIN_JUMP, _MAX_PAUSE = 100.0, 2.0
+
+Floats = NDArray[np.float64]
+
+
+class TurningAngle:
+    """Find where the angle of an axis begins again, over successive blocks of rows.
+
+    `count` is the angle of one count [degree], or None if the angles are not whole numbers.
+
+    Examples
+    --------
+    >>> angle = TurningAngle(None)
+    >>> angle.find_turns(np.array([357.0, 358.0, 359.0, 1.0, 2.0]), np.arange(5))
+    >>> angle.rows, angle.added
+    ([3], [360.0])
+    """
+
+    def __init__(self, count: float | None):
+        self.counters = [] if count is None else [size * abs(count) for size in _COUNTERS]
+        self.last: tuple[float, int] | None = None  # angle as it is written [degree], stamp [ns]
+        self.low, self.high = np.inf, -np.inf
+        self.first = 0  # row of the next block
+        #: Rows from which on angles [degree] are added, and rows of jumps that are not explained.
+        self.rows: list[int] = []
+        self.added: list[float] = []
+        self.jumps: list[int] = []
+
+    def find_turns(self, angles: Floats, stamps: NDArray[np.int64]) -> None:
+        """Look through the angles [degree] and stamps [ns] of the next block."""
+        places = np.flatnonzero(np.isfinite(angles))
+        if places.size:
+            written, times = angles[places], stamps[places]
+            self.low = min(self.low, float(written.min()))
+            self.high = max(self.high, float(written.max()))
+            angle, time = (written[0], times[0]) if self.last is None else self.last
+            steps, pauses = np.diff(written, prepend=angle), np.diff(times, prepend=time)
+            self._find_in_steps(written, steps, pauses, self.first + places)
+            self.last = float(written[-1]), int(times[-1])
+        self.first += angles.size
+
+    def _find_in_steps(
+        self, written: Floats, steps: Floats, pauses: NDArray[np.int64], rows: NDArray[np.int64]
+    ) -> None:
+        sizes, span = np.abs(steps), self.high - self.low
+        usual = float(np.quantile(sizes[sizes > 0], 0.9)) if (sizes > 0).any() else 0.0
+        counters = [size for size in self.counters if size > _MIN_PERIOD * usual]
+        period = min((p for p in [*counters, _CIRCLE] if span <= p * (1 + 1e-9)), default=np.inf)
+        forward = pauses[pauses > 0]
+        waits = pauses / float(np.median(forward)) if forward.size else np.ones(pauses.size)
+        reach = _REACH * usual * np.maximum(waits, 1.0)
+        is_turn = (sizes > period / 2) & (np.abs(sizes - period) <= np.minimum(reach, period / 2))
+        is_jump = (sizes > _MIN_JUMP / _REACH * reach) & ~is_turn
+        # motion and a wrong value have several such steps in succession
+        is_quiet = sizes <= reach
+        is_jump &= np.append(True, is_quiet[:-1]) & np.append(is_quiet[1:], True)
+        is_reset = is_jump & (np.abs(written) <= reach) & (waits <= _MAX_PAUSE)
+        is_reset &= np.cumsum(is_jump & ~is_reset) == 0  # otherwise it may be the way back
+        if self.jumps:
+            is_reset[:] = False
+        added = np.where(
+            is_reset, written - steps, -np.sign(steps) * (period if is_turn.any() else 0.0)
+        )
+        is_found = is_turn | is_reset
+        self.rows += rows[is_found].tolist()
+        self.added += added[is_found].tolist()
+        self.jumps += rows[is_jump & ~is_reset].tolist()
+
+
+class _Continued(RowSource):
+    """Angles to which turns are added."""
+
+    def __init__(self, array: Any, turns: list[TurningAngle]):
+        self.parts, self.shape, self.dtype = (array,), array.shape, np.dtype(np.float64)
+        self.rows = [np.array(turn.rows, dtype=np.int64) for turn in turns]
+        self.added = [np.cumsum([0.0, *turn.added]) for turn in turns]
+
+    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+        read_into(self.parts[0], row, begin, out)
+        turns = np.searchsorted(self.rows[row], np.arange(begin, begin + out.size), side="right")
+        out += self.added[row][turns]
+
+
+def _pack_continued(encoding: dict[Any, Any], turns: list[TurningAngle]) -> dict[Any, Any]:
+    """Return the encoding of continued angles: counts if they remain whole numbers."""
+    count = encoding.get("scale_factor")
+    added = np.concatenate([turn.added for turn in turns])
+    if count is None or np.abs(added / count - np.rint(added / count)).max(initial=0) > 1e-6:
+        return {}
+    reach = max(
+        max(abs(turn.low), abs(turn.high)) + np.abs(np.cumsum(turn.added)).max(initial=0)
+        for turn in turns
+    )
+    return pack_counts(reach / count, count)
+
+
+def continue_angles(raw: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
+    """Continue the cumulative angles of a raw log where they begin again, and return notes.
+
+    An angle that wraps around (360 degree) or a counter of 16, 24 or 32 bits that is full gets its
+    period, and a counter that was set to zero the angle that it had.
+    """
+    variable = raw["angle"]
+    count = variable.encoding.get("scale_factor")
+    turns = [TurningAngle(count) for _ in range(variable.sizes["axis"])]
+    for begin in range(0, raw.sizes["row"], BLOCK_ROWS):
+        end = min(begin + BLOCK_ROWS, raw.sizes["row"])
+        angles = np.asarray(read_slice(variable.data, begin, end), dtype=np.float64)
+        rows = np.arange(begin, end)
+        stamps = read_stamps(raw, begin, end) if "time" in raw.variables else rows
+        for turn, values in zip(turns, angles, strict=True):
+            turn.find_turns(values, stamps)
+    notes = []
+    for axis, turn in zip(raw["axis"].values, turns, strict=True):
+        for rows_of, text in (
+            (turn.rows, "begins again (it wraps around, or its counter does) and is continued"),
+            (turn.jumps, "jumps; variances over these rows are wrong: split the log there"),
+        ):
+            if rows_of:
+                file, row = file_of(raw, rows_of[0])
+                places = "1 place" if len(rows_of) == 1 else f"{len(rows_of)} places"
+                notes.append(f"{file}: the angle of axis {axis} {text}: {places}, first row {row}")
+    if not any(turn.rows for turn in turns):
+        return raw, notes
+    source = _Continued(variable.data, turns)
+    is_plain = isinstance(variable.data, np.ndarray)
+    data = source[:, :] if is_plain else make_dask(source, variable.chunks)
+    packing = _pack_continued(variable.encoding, turns)
+    return raw.assign(angle=(variable.dims, data, variable.attrs, packing)), notes
