@@ -138,8 +138,8 @@ def describe_rate(
         )
     if estimate.even is not None:
         notes.append(
-            f"{where}: the steps between stamps recur: the stamps fit {rate:.10g} Hz with a "
-            "share of "
+            f"{where}: the steps between stamps recur, or the rows come in packets: the stamps fit "
+            f"{rate:.10g} Hz with a share of "
             f"{1 - estimate.even / rate:.2g} missing, and {estimate.even:g} Hz with none; "
             f"{rate:.10g} Hz is used: "
             f"if no rows are missing, give --rate {estimate.even:g}"

@@ -38,6 +38,7 @@ from gyrostab.ingest.grid.starting_period import (
     comb_peaks,
     finer_period,
     losses_accumulate,
+    packet_rate,
     period_of_lines,
     readable_stamps,
     recut_blocks,
@@ -73,8 +74,8 @@ class RateEstimate:
     counted: bool  # whether rows are placed by their count, not by their stamps
     coarse: bool  # whether many rows share one stamp
     raw: float  # rate before rounding to a plain number [Hz]
-    #: Rate [Hz] if the recurring losses found in the stamps are not losses; None without such
-    #: losses.
+    #: Rate [Hz] if the recurring losses found in the stamps are not losses, or if rows arrive in
+    #: packets; None without these.
     even: float | None = None
     #: Higher rate [Hz] near whose samples the stamps lie, if rows are missing; None without one.
     finer: float | None = None
@@ -150,12 +151,17 @@ def _estimate_ordered(stamps: Stamps, stretches: Parts, parts: Parts, sure: floa
         jitter = _fit_jitter(stretches, guesses, coarse, sure)
         if jitter is not None:
             estimate = _estimate_with_jitter(stamps, jitter, coarse, sure)
-            return replace(estimate, finer=_finer_rate(stretches, peaks, jitter, sure))
+            even = packet_rate(stretches, estimate.rate)
+            return replace(estimate, even=even, finer=_finer_rate(stretches, peaks, jitter, sure))
         if np.mean(steps == 0) >= SHARED_SHARE:  # rows are not doubled: that would fit
             period, counted, coarse = time_per_row(stretches, ticks=True), True, True
     longest = longest_step(parts, period) if counted else sure * period
     estimate = _estimate_pooled(stamps, period, longest, counted=counted, coarse=coarse)
-    return estimate if finer is None else replace(estimate, finer=float(f"{SECOND / finer:.4g}"))
+    return replace(
+        estimate,
+        even=None if counted else packet_rate(stretches, estimate.rate),
+        finer=None if finer is None else float(f"{SECOND / finer:.4g}"),
+    )
 
 
 def _fit_jitter(

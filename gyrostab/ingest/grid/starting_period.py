@@ -32,6 +32,9 @@ _PEAK_WIDTH = 0.02  # relative distance of two peaks, at least
 #: independent steps below which they do not.
 _MIN_SPAN_ROWS, _SPAN_ROWS, _MIN_ACCUMULATION = 16, 256, 0.2
 
+#: Least share of the steps that are pauses, of rows in bursts or packets.
+_MIN_PAUSE_SHARE = 0.02
+
 Integers = NDArray[np.int64]
 Parts = list[Integers]
 #: Rows and their stamps, or the stamps that are used of some rows.
@@ -147,6 +150,29 @@ def finer_period(parts: Parts, period: float) -> float | None:
     return single if (is_whole & np.any(recurrences, axis=0) & uneven).mean() > 0.5 else None
 
 
+def packet_rate(stretches: Parts, rate: float) -> float | None:
+    """Return the rate [Hz] of rows in packets with pauses between them; None for other rows.
+
+    The steps within a packet give the higher `rate` [Hz]; stamps alone cannot distinguish rows that
+    arrive in packets from samples that are lost between groups. Random losses have no single steps.
+
+    Examples
+    --------
+    >>> packets = [np.arange(8000) // 4 * 40_000_000 + np.arange(8000) % 4 * 100_000]
+    >>> packet_rate(packets, 10_000.0), packet_rate(packets, 100.0)
+    (100.0, None)
+    """
+    steps = np.concatenate([np.diff(readable_stamps(stretch)) for stretch in stretches])
+    rising, period = steps[steps > 0], SECOND / rate
+    mean = SECOND / time_per_row(stretches)
+    is_packed = (
+        mean < rate / LONGEST
+        and np.mean(steps > LONGEST * period) > _MIN_PAUSE_SHARE
+        and np.quantile(rising, 0.5, method="lower") < 1.5 * period
+    )
+    return float(f"{mean:.4g}") if is_packed else None
+
+
 def _residual_range(parts: Parts, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Fit lines to stretches of `length` stamps: slopes [ns a row], residual ranges [ns]."""
     values = cut_stretches(parts, length)
@@ -235,7 +261,9 @@ def _is_bursty(parts: Parts, steps: NDArray[np.float64], period: float) -> bool:
     """Return whether long steps are pauses between bursts, not multiples of the short ones."""
     long = steps[(steps > 1.5 * period) & (steps < 50 * period)]
     inliers = steps[np.abs(steps) < 50 * period]
-    if len(long) <= max(10, 0.02 * len(steps)) or inliers.sum() <= 1.2 * period * len(inliers):
+    if len(long) <= max(10, _MIN_PAUSE_SHARE * len(steps)) or inliers.sum() <= 1.2 * period * len(
+        inliers
+    ):
         return False
     if abs(np.exp(2j * np.pi * long / period).mean()) < 0.2:
         return True
