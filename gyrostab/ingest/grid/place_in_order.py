@@ -79,6 +79,13 @@ class _Placer:
         self.count0, self.level, self.phase, self.observed = int(count[at[0]]), 0, 0.0, 0
         self.base = int(count[at[0]] - count[0])
 
+    def _leave_out_first(self, at: Integers, stamps: Integers) -> Integers:
+        """Leave out the first row if it may be within a group of rows with one stamp, not first."""
+        if self.jitter.observe != "first" or len(at) < 2:
+            return at
+        step = stamps[at[1]] - stamps[at[0]]
+        return at[1:] if step < 1.5 * self.jitter.group * self.period else at
+
     def _set_first_sample(self, level: int) -> None:
         """Set the first sample of the piece, whose first row has lost `level` samples."""
         self.level = level
@@ -94,6 +101,7 @@ class _Placer:
         at = observe_rows(stamps, self.jitter.observe, self.period)
         begins = begins or self.start is None
         if begins:
+            at = self._leave_out_first(at, stamps)
             self._begin_piece(count, stamps, at)
         levels, phases = np.empty(len(at), dtype=np.int64), np.empty(len(at))
         if len(at):

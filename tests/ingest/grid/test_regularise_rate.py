@@ -104,6 +104,15 @@ def test_whole_seconds_shared_by_many_rows_are_not_duplicates():
     assert abs((log.time.values[0] - np.datetime64(START, "ns")) / np.timedelta64(1, "ms")) < 11
 
 
+@pytest.mark.parametrize("first", [0, 3, 5, 9])
+def test_log_that_begins_between_two_changes_of_a_shared_stamp_has_no_gap(first):
+    count = np.arange(first, first + 5000)
+    samples = np.where(count < 200, count, count + 1000)  # a pause
+    log = regularise(raw_log(stamps_of(samples // 10, 10.0)))
+    assert log.attrs["sampling_rate_hz"] == 100.0
+    assert np.array_equal(log.rate.values[0], expected(samples - first), equal_nan=True)
+
+
 def test_declared_rate_without_time():
     raw = raw_log(None, np.arange(6.0), temperature=[20.0, np.nan, np.nan, np.nan, 21.0, np.nan])
     raw.attrs |= {"declared_rate_hz": 2.0, "start": "2026-03-11T11:00:00"}
