@@ -667,7 +667,6 @@ class TestSurface:
             lambda s: s.assign_coords(tau=s.tau * 1.5),
             lambda s: s.assign_attrs(sampling_rate_hz=33.0),
             lambda s: s.assign(avar=s.avar.drop_attrs()),
-            lambda s: s.isel(axis=0),
             lambda s: s.drop_attrs(deep=False),
         ],
     )
