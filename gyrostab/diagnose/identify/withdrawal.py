@@ -135,11 +135,11 @@ def withdraw_effects(
     identified: list[Selection],
     unidentified: Sequence[Selection],
 ) -> tuple[list[Selection], list[Selection]]:
-    """Withdraw effects that leave structure in time, in the means or powers, or more covariance.
+    """Withdraw effects that leave structure in time, in the means or powers.
 
     `state` has all selections in the model. The second result is what is unidentified instead.
     """
-    remaining = _without_part_of_covariance(identified, unidentified)
+    remaining = list(identified)
     withdrawn: list[Selection] = []
     for axis in state.axes:
         remaining, unexplained = _withdraw_in_means(
@@ -276,27 +276,6 @@ def _without_part_of_drift(
         if evidence_nats >= threshold:
             remaining.append(reduce_selection(identification, elsewhere, evidence_nats))
     return remaining
-
-
-def _without_part_of_covariance(
-    identified: Sequence[Selection], unidentified: Sequence[Selection]
-) -> list[Selection]:
-    """Return effects without those that may be a part of an unidentified covariance of axes.
-
-    Noise in common explains the upper end of the spectrum of a bias that wanders on all axes.
-    """
-    unexplained = sum(
-        component.evidence_nats
-        for component in components_of(unidentified)
-        if component.statistic.is_pairwise
-    )
-    return [
-        identification
-        for identification in identified
-        if any(identification.driver)
-        or not all(component.statistic.is_pairwise for component in identification.components)
-        or identification.evidence_nats >= unexplained
-    ]
 
 
 def _evidence_on(selection: Selection, axis: str) -> float:

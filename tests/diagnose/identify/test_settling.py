@@ -15,11 +15,7 @@ from gyrostab.diagnose.identify import selection as selecting
 from gyrostab.diagnose.identify.examination import Examination, nuisance_alternatives
 from gyrostab.diagnose.identify.identification import make_selection
 from gyrostab.diagnose.identify.settling import prune_selections, settle_selections
-from gyrostab.diagnose.identify.withdrawal import (
-    _without_part_of_covariance,
-    _without_part_of_drift,
-    withdraw_effects,
-)
+from gyrostab.diagnose.identify.withdrawal import _without_part_of_drift, withdraw_effects
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -110,16 +106,6 @@ def test_a_drift_takes_only_what_it_explains_on_its_axis(jump_nats, on_x, remain
         assert identification.evidence_nats == sum(jump_nats[axis] for axis in identification.axes)
         assert identification.instead == {"warm_up": identification.evidence_nats - 5.0}
         assert {component.row for component in identification.components} == {identification.axes}
-
-
-@pytest.mark.parametrize(("nats", "is_kept"), [(20.0, False), (40.0, True)])
-def test_an_unidentified_covariance_takes_what_explains_less(nats, is_kept):
-    """Noise in common that leaves more covariance than it explains may be a part of it."""
-    shared = make_selection(_explain("shared_source", "cross_spectrum", {"x,y": nats}), 8.0)
-    other = make_selection(_explain("~cov", "cross_spectrum", {"x,y": 30.0}), 8.0)
-    assert _without_part_of_covariance([shared], [other]) == ([shared] if is_kept else [])
-    followed = replace(shared, driver=("vibration",))
-    assert _without_part_of_covariance([followed], [other]) == [followed]
 
 
 def test_both_of_a_pair_are_selected_at_once():
