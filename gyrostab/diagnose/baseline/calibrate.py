@@ -173,9 +173,10 @@ def calibrate_on_known(
     """Calibrate the noise again on those quiescent blocks of a baseline that are known (block,).
 
     A baseline that is not that of `calibrate_noise` is returned as it is, and so is one of which
-    too few blocks are known.
+    too few blocks with a spectrum are known.
     """
-    chosen = baseline["quiet"].values & known
+    has_spectrum = np.isfinite(blocks["power"].values).any(axis=-1)
+    chosen = baseline["quiet"].values & known & has_spectrum
     if (
         baseline.attrs.get("source") != "calibrated"
         or "recalibrated" in baseline.attrs

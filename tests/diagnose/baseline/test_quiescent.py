@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import calibrate_noise
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise, calibrate_on_known
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -45,6 +45,17 @@ def test_the_error_of_a_short_calibration_covers_the_truth():
             value, error = value_of(calibrate_noise(blocks, quiet=(0.0, 45.0)), "N")
         pulls.append((value - 0.003) / error)
     assert np.abs(pulls).max() < 4.0
+
+
+@pytest.mark.parametrize("left_out", [False, True])
+def test_an_axis_without_spectra_in_the_known_blocks_is_not_calibrated_again(left_out):
+    blocks = reduce_log(log({"N": 0.003}, duration="30min"))
+    baseline = calibrate_noise(blocks)
+    known = np.arange(blocks.sizes["block"]) % 4 > 0
+    if left_out:
+        blocks["power"].values[0, known] = np.nan
+    again = calibrate_on_known(blocks, baseline, known)
+    assert (again is baseline) == left_out
 
 
 def test_quiet_time_scales_the_noise_of_a_model():
