@@ -456,7 +456,7 @@ class TestLabels:
             ({"window": "10s", "taus": 0}, "above 0"),
             ({"window": "10s", "taus": ["soon"]}, "40 .how many., octave, all or 0.1s.*for taus"),
             ({"window": "10s", "axis": "q"}, "axis 'q' is not in the log; it has x"),
-            ({"window": "10s", "axis": 0}, "axis 0 is not in the log; it has x"),
+            ({"window": "10s", "axis": 0}, "axis '0' is not in the log; it has x"),
             ({"window": True}, "window True is not a duration"),
             ({"window": "10s", "min_strict": "0.3"}, "min_strict='0.3': give a share from 0 to 1"),
             ({"window": "10s", "min_strict": -0.1}, "min_strict=-0.1"),
