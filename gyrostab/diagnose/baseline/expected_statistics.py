@@ -126,7 +126,7 @@ def undo_transfer(
     transfer : callable
         The output of the effect for each rate.
     mean : ndarray, shape (block,)
-        Means after the effect.
+        Means after the effect, NaN where a block is missing, whose share is 1.
     variance : float
         Variance of the samples about their means, after the effect or, if `known`, before it.
 
@@ -137,11 +137,10 @@ def undo_transfer(
     >>> passed.mean.round(2), round(passed.variance, 2)
     (array([0.7]), 2.24)
     """
-    finite = np.isfinite(mean)
-    order = np.argsort(np.where(finite, mean, 0.0), kind="stable")
-    groups = np.array_split(order, min(_MAX_MEANS, mean.size))
-    after = np.array([np.nan_to_num(mean[group]).mean() for group in groups])
-    weight = np.array([group.size for group in groups], np.float64) / mean.size
+    order = np.argsort(mean, kind="stable")[: np.count_nonzero(np.isfinite(mean))]
+    groups = np.array_split(order, max(min(_MAX_MEANS, order.size), 1))
+    after = np.array([mean[group].mean() if group.size else 0.0 for group in groups])
+    weight = np.array([group.size for group in groups], np.float64) / max(order.size, 1)
     before, square = after.copy(), max(variance, 1e-300)
     for _ in range(_ROUNDS):
         noise = np.sqrt(square) * _NORMAL
@@ -152,8 +151,7 @@ def undo_transfer(
         if not known:
             left = float(weight @ spread) / square
             square *= np.clip(variance / max(left * square, 1e-300), 0.5, 2.0)
-    share = np.empty(mean.size)
-    moved = np.empty(mean.size)
+    share, moved = np.ones(mean.size), np.zeros(mean.size)
     for number, group in enumerate(groups):
         share[group] = max(spread[number] / square, _MIN_SHARE)
         moved[group] = before[number] - after[number]

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from gyrostab.diagnose.estimate.constant_rate import constant_rates, undo_noise_loss
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -57,6 +58,7 @@ def test_rounded_values_have_the_constant_rate_and_noise_of_those_before(mode, n
     assert undone["y"]["N"] == pytest.approx(noise, rel=0.04)
 
 
+@pytest.mark.parametrize("lost", [False, True])
 @pytest.mark.parametrize(
     "table",
     [
@@ -68,8 +70,15 @@ def test_rounded_values_have_the_constant_rate_and_noise_of_those_before(mode, n
     ],
     ids=lambda table: "-".join(map(str, table.values())),
 )
-def test_noise_and_rate_are_those_before_a_limit_or_a_dead_zone(table):
+def test_noise_and_rate_are_those_before_a_limit_or_a_dead_zone(table, lost):
     blocks = reduce_simulation(table | {"axes": ["y"]}).sel(axis=["y"])
+    if lost:  # every fourth block
+        is_lost = xr.DataArray(np.arange(blocks.sizes["block"]) % 4 == 0, dims="block")
+        blocks = blocks.assign(
+            mean=blocks["mean"].where(~is_lost),
+            variance=blocks["variance"].where(~is_lost),
+            samples=blocks["samples"].where(~is_lost, 0),
+        )
     after = float(blocks["variance"].mean())
     recorded = {"y": {"N": math.sqrt(after / (HOUR * 10.0)), "B": 0.01, "K": 0.0}}
     effect = make_effect(table)
