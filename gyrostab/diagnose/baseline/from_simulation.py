@@ -21,7 +21,11 @@ from gyrostab.diagnose.baseline.quiescent import (
     significant_level,
 )
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_evidence, line_skirt
-from gyrostab.diagnose.predict.linear_model import average_in_bands, unspread_share
+from gyrostab.diagnose.predict.linear_model import (
+    average_in_bands,
+    unspread_share,
+    unspread_share_of_lines,
+)
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables, weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -168,6 +172,7 @@ def _line_statistics(
     near_unexplained = binary_dilation(unexplained, np.ones((1, 3), np.bool_))
     lines_per_band = np.diff(band_edges(int(simulated.attrs["block_samples"])))
     near_unexplained = np.repeat(near_unexplained, lines_per_band, axis=1)
+    share = unspread_share_of_lines(simulated)
     for row, axis in enumerate(simulated["axis"].values):
         in_skirt = np.zeros(evidence_nats.shape[1], np.bool_)
         for _ in range(_MAX_LINES):
@@ -180,7 +185,7 @@ def _line_statistics(
             continue
         mean = np.average(power[row][good], axis=0, weights=weight[row][good])
         level = np.where(in_skirt, local_level(mean[None])[0], mean)
-        lines[row] = np.maximum(mean - level, 0.0)
+        lines[row] = np.maximum(mean - level, 0.0) / share[row]
         weak = (simulated["sine_nats"].values[row] > settings.line_nats) & ~in_skirt
         square, stderr = (
             simulated[f"sine_square{end}"].values[row] / (4.0 * frequency[0])

@@ -12,7 +12,11 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
 from gyrostab.diagnose.predict.filter_response import filter_factors
-from gyrostab.diagnose.predict.linear_model import average_in_bands, unspread_share
+from gyrostab.diagnose.predict.linear_model import (
+    average_in_bands,
+    unspread_share,
+    unspread_share_of_lines,
+)
 from gyrostab.diagnose.predict.windows import complex_factors, predict_effect
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES
@@ -167,9 +171,9 @@ def remove_known_lines(
         return blocks
     power, weight = blocks["line_power"], blocks["line_weight"]
     noise = expected_lines(baseline, blocks["line_frequency"].values)[:, None]
-    known_power, largest_power = (
-        baseline[name].values[:, None] for name in ("lines", "lines_most")
-    )
+    without_gaps = [baseline[name].values for name in ("lines", "lines_most")]
+    share = unspread_share_of_lines(blocks)[:, None]
+    known_power, largest_power = ((share * lines)[:, None] for lines in without_gaps)
     with np.errstate(divide="ignore", invalid="ignore"):
         scatter = np.sqrt((noise**2 + 2.0 * noise * largest_power) / weight.values[..., None])
     above = power.values - noise - known_power
@@ -184,8 +188,7 @@ def remove_known_lines(
     square, stderr = (blocks[f"sine_square{end}"].values for end in ("", "_stderr"))
     step = float(blocks["line_frequency"][0])
     known_square, largest_square = (
-        4.0 * step * _take_leakage(lines[:, 0]).sum(axis=-1)
-        for lines in (known_power, largest_power)
+        4.0 * step * _take_leakage(lines).sum(axis=-1) for lines in without_gaps
     )
     exceeds = square - largest_square > error * largest_square + settings.clear_sigma * stderr
     peaks = _take_leakage(baseline["peaks"].values).sum(axis=-1)

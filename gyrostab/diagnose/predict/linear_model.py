@@ -113,6 +113,13 @@ def unspread_share(blocks: xr.Dataset, row: str = "axis") -> Array:
     )
 
 
+def unspread_share_of_lines(blocks: xr.Dataset) -> Array:
+    """Return the `unspread_share` of the mean periodograms of the record, (axis,)."""
+    used = np.isfinite(blocks["neighbours"].values)
+    total = (unspread_share(blocks) * used).sum(axis=1)
+    return np.asarray(np.where(used.any(axis=1), total / np.maximum(used.sum(axis=1), 1), 1.0))
+
+
 def spread_by_gaps(density: Array, blocks: xr.Dataset, row: str = "axis") -> Array:
     """Mix a density with its mean over frequency, as gaps do; (axis, block, band).
 

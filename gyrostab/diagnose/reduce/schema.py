@@ -202,7 +202,7 @@ BASELINE: dict[str, Variable] = {
     "cross": Variable(_PAIR_BAND, _POWER, "expected cross-spectrum"),
     "cross_error": Variable(("pair", "band"), "1", "error of the coherency"),
     "form_shape": Variable(("axis", "band"), "1", "shape of the distribution of the form"),
-    "lines": Variable(_LINE, _POWER, "expected power of steady lines"),
+    "lines": Variable(_LINE, _POWER, "expected power of steady lines without gaps"),
     "lines_most": Variable(_LINE, _POWER, "largest power of them at any offset of the frequency"),
     "peaks": Variable(_LINE, _POWER, "expected power of broad peaks"),
     "line_noise": Variable(_LINE, _POWER, "expected power of noise behind a filter"),

@@ -28,6 +28,7 @@ _MIN_LEVELS = 4  # intervals of `_LEVEL_LINES` that a spectrum must have
 _NOISE_BANDS = 16  # of equal width, in which periodograms are compared; design choice
 _EQUAL_SIGMA = 2.5  # by which equal levels may differ by chance: one band in 20 with 8 periodograms
 _MIN_SHARE = 0.25  # of a transformed length that must be present; design choice
+_WINDOW_PARTS = 1024  # of a window, whose spectrum is that of its sums over parts below 10 lines
 #: Expected nats of a sine of known frequency and phase, a sample of its prior.
 _STRENGTHS = 3.0 * 3.0 ** np.arange(12)
 
@@ -39,6 +40,7 @@ class _Spectrum:
         lines, self.size, self.taper = ordinates(_FINER * size), size, taper(size)
         self.total = np.zeros((axes, lines))  # [degree2 hour-2 Hz-1]
         self.used = np.zeros(axes, np.int64)  # their number
+        self.in_line = np.zeros(axes)  # sum of the shares of a sine's power in its line
         # bands of noise: first line, and number of lines
         self.edges = np.linspace(0, lines, min(_NOISE_BANDS, lines), endpoint=False).astype(int)
         self.widths = np.diff(self.edges, append=lines)
@@ -53,9 +55,11 @@ class _Spectrum:
         centred = np.where(present, values - values[present].mean(), 0.0) * self.taper
         lines = self.total.shape[1]
         power = np.abs(np.fft.rfft(centred, _FINER * self.size)[1 : lines + 1]) ** 2
-        power /= (self.taper**2 * present).sum() * rate
+        window = self.taper * present
+        power /= (window**2).sum() * rate
         self.total[axis] += power
         self.used[axis] += 1
+        self.in_line[axis] += _share_in_line(window)
         level = np.add.reduceat(power, self.edges) / self.widths
         self.band_total[axis] += level
         self.band_largest[axis] = np.maximum(self.band_largest[axis], level)
@@ -164,6 +168,8 @@ class SineSearch:
         # (axis, line, neighbour)
         peak, usual, shape = (part[:, neighbours] for part in (power, level, count))
         above = peak - usual
+        in_line = (spectrum.in_line / np.maximum(spectrum.used, 1))[:, None]
+        scale = 4.0 * step / np.where(usable[:, None], in_line, 1.0)
         # Power N and a sine S have the variance N^2 + 2 N S; frequencies within a line are one.
         variance = np.maximum(2.0 * peak - usual, usual)
         noise = np.sqrt(_FINER * (usual * variance / shape).sum(axis=-1))
@@ -174,10 +180,25 @@ class SineSearch:
             "sine_nats": gains - cost / sharing,
             "sine_frequency": centre,
             "sine_resolution": np.full(chosen.size, _FINER * step),
-            "sine_square": 4.0 * step * above.sum(axis=-1),
-            "sine_square_stderr": 4.0 * step * noise,
+            "sine_square": scale * above.sum(axis=-1),
+            "sine_square_stderr": scale * noise,
         }
         return place[chosen], total[chosen], arrays
+
+
+def _share_in_line(window: Array) -> float:
+    """Return the share of a sine's power in the `LEAK_LINES` on either side of its frequency.
+
+    Lost samples (zeros of the window) spread the rest over the spectrum.
+    """
+    size = window.size
+    edges = np.linspace(0, size, min(_WINDOW_PARTS, size), endpoint=False).astype(np.int64)
+    middle = 0.5 * (edges + np.append(edges[1:], size) - 1)
+    turns = np.outer(np.arange(1, _FINER * LEAK_LINES + 1), middle) / (_FINER * size)
+    sums = np.add.reduceat(window, edges)
+    spectrum = np.exp(-2j * math.pi * turns) @ sums
+    total = sums.sum() ** 2 + 2.0 * float((np.abs(spectrum) ** 2).sum())
+    return float(total / (_FINER * size * (window**2).sum()))
 
 
 def sine_factors(ratio: Array, count: Array | float) -> Array:

@@ -22,7 +22,7 @@ from gyrostab.diagnose.predict.candidates import (
     Variant,
 )
 from gyrostab.diagnose.predict.condition import bands_at, free_covariance
-from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.linear_model import State, unspread_share_of_lines
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.diagnose.reduce.schema import axis_values
@@ -276,10 +276,11 @@ def estimate_line(
     level = local_level(total)
     skirt = line_skirt(blocks, axis, place, settings)
     step = float(np.diff(lines[:2])[0])
-    above = total[skirt] - level[skirt]
+    share = float(unspread_share_of_lines(blocks.sel(axis=[axis]))[0])
+    above = (total[skirt] - level[skirt]) / share
     # Power N and a line S have the variance N^2 + 2 N S.
     variance = level[skirt] * np.maximum(2.0 * total[skirt] - level[skirt], level[skirt])
-    noise = 4.0 * step * float(np.sqrt(variance.sum() / count))
+    noise = 4.0 * step / share * float(np.sqrt(variance.sum() / count))
     positive = np.maximum(above, 0.0)
     frequency = float((positive * lines[skirt]).sum() / max(positive.sum(), 1e-300))
     return _root_of_square(4.0 * float(above.sum()) * step, noise), (frequency, 0.5 * step)

@@ -31,8 +31,10 @@ def model(size: float, **more: object) -> dict[str, object]:
 
 
 @cache
-def log_of(seed: int, size: float) -> xr.Dataset:
-    return simulate(model(size), duration="30min", rate=10.0, seed=seed).compute()
+def log_of(seed: int, size: float, lost: float = 0.0) -> xr.Dataset:
+    log = simulate(model(size), duration="30min", rate=10.0, seed=seed).compute()
+    is_lost = np.random.default_rng(seed).random(log.sizes["time"]) < lost
+    return log.assign(rate=log["rate"].where(~is_lost))
 
 
 def evidence_nats(blocks: xr.Dataset, baseline: xr.Dataset) -> float:
@@ -63,16 +65,15 @@ def test_a_known_line_is_removed_at_any_frequency(amplitude, frequency):
         )
 
 
-def test_only_a_line_well_above_the_model_is_reported():
-    baseline = baseline_from_model(reduce_log(log_of(1, SIZE)), model(SIZE))
-    assert (
-        evidence_nats(remove_known_lines(reduce_log(log_of(1, 1.03 * SIZE)), baseline), baseline)
-        < 6.0
-    )
-    assert (
-        evidence_nats(remove_known_lines(reduce_log(log_of(1, 1.5 * SIZE)), baseline), baseline)
-        > 20.0
-    )
+@pytest.mark.parametrize("lost", [0.0, 0.4])
+def test_only_a_line_well_above_the_model_is_reported(lost):
+    def left(factor: float) -> float:
+        blocks = remove_known_lines(reduce_log(log_of(1, factor * SIZE, lost)), baseline)
+        return evidence_nats(blocks, baseline)
+
+    baseline = baseline_from_model(reduce_log(log_of(1, SIZE, lost)), model(SIZE))
+    assert left(1.03) < 6.0
+    assert left(1.5) > 20.0
 
 
 def test_null_records_have_the_peaks_of_the_model():
@@ -117,12 +118,23 @@ def test_power_beyond_the_model_is_named(seed, inside, known, left):
     )
 
 
-@pytest.mark.parametrize("amplitude", [0.07, 0.3])
-@pytest.mark.parametrize("frequency", [1.3, 1.312, 1.325])
-def test_a_known_sine_is_no_sine_of_the_recording(amplitude, frequency):
+@pytest.mark.parametrize(
+    ("amplitude", "frequency", "lost"),
+    [
+        (0.07, 1.3, 0.0),
+        (0.07, 1.312, 0.0),
+        (0.07, 1.325, 0.0),
+        (0.3, 1.3, 0.0),
+        (0.3, 1.312, 0.4),
+        (0.3, 1.325, 0.0),
+    ],
+)
+def test_a_known_sine_is_no_sine_of_the_recording(amplitude, frequency, lost):
     line = {"name": "spectral_line", "amplitude": amplitude, "frequency": frequency}
     made = {"noise": NOISE, "effect": [line], "log": {"axes": ["x"]}}
-    blocks = reduce_log(simulate(made, duration="30min", rate=10.0, seed=8).compute())
+    log = simulate(made, duration="30min", rate=10.0, seed=8).compute()
+    is_lost = np.random.default_rng(8).random(log.sizes["time"]) < lost
+    blocks = reduce_log(log.assign(rate=log["rate"].where(~is_lost)))
     assert float(blocks["sine_nats"].max()) > 10.0
     known = remove_known_lines(blocks, baseline_from_model(blocks, made))
     assert float(known["sine_nats"].max()) < 3.0
@@ -132,6 +144,16 @@ def test_a_known_sine_is_no_sine_of_the_recording(amplitude, frequency):
     place = int(too_small["sine_nats"].values[0].argmax())
     left, all_of_it = (float(reduced["sine_square"][0, place]) for reduced in (too_small, blocks))
     assert all_of_it - left == pytest.approx((amplitude / 4.0) ** 2, rel=0.1)
+
+
+def test_lines_of_a_simulated_log_are_known_with_other_gaps():
+    simulated = reduce_log(log_of(10, SIZE))
+    recorded = reduce_log(log_of(9, SIZE, 0.4))
+    for first, second in [(recorded, simulated), (simulated, recorded)]:
+        known = remove_known_lines(first, baseline_from_simulation(first, second))
+        power = known["line_power"].mean("part")
+        is_near = np.abs(first["line_frequency"].values - PLACE) < 0.1
+        assert float(power[:, is_near].max()) < 2.0 * float(power[:, ~is_near].median())
 
 
 def test_a_weak_sine_of_a_simulated_log_is_known():

@@ -89,10 +89,11 @@ def sines(
     size: int = 18_000,
     axes: int = 2,
     jump: float = 0.0,
+    lost: float = 0.0,
 ) -> xr.Dataset:
     """White noise of 0.57 deg/h with sines of wandering phase [rad] on the first axis.
 
-    The last axis may have a jump [deg/h] in the middle.
+    The last axis may have a jump [deg/h] in the middle. The share `lost` of the samples is missing.
     """
     rng = np.random.default_rng(2)
     t = np.arange(size) / 10.0
@@ -101,19 +102,21 @@ def sines(
         phase = np.cumsum(rng.normal(0.0, wander / np.sqrt(size), size))
         rates[0] += amplitude * np.sin(2.0 * np.pi * frequency * t + phase)
     rates[-1, size // 2 :] += jump
+    rates[:, rng.random(size) < lost] = np.nan
     return reduce_log(make_log(rates, rate=10.0, unit="deg/h"))
 
 
-@pytest.mark.parametrize("wander", [0.0, 30.0])
-def test_the_skirt_contains_only_its_line(wander: float) -> None:
-    blocks = sines({1.0: 3.0, 3.1: 1.0}, wander=wander)
+@pytest.mark.parametrize(("wander", "lost"), [(0.0, 0.0), (30.0, 0.0), (30.0, 0.4)])
+def test_the_skirt_contains_only_its_line(wander: float, lost: float) -> None:
+    blocks = sines({1.0: 3.0, 3.1: 1.0}, wander=wander, lost=lost)
     lines = blocks["line_frequency"].values
     place = int(np.abs(lines - 1.0).argmin())
     skirt = line_skirt(blocks, "x", place)
     assert skirt[place]
     assert (np.abs(lines[skirt] - 1.0) < 1.5).all()
     (amplitude, error), (frequency, _) = estimate_line(blocks, "x", place)
-    assert amplitude == pytest.approx(3.0, abs=max(4.0 * error, 0.15))
+    # the level between the lines, raised by the losses, hides the ends of the skirt
+    assert amplitude == pytest.approx(3.0, abs=max(4.0 * error, 0.25 if lost else 0.15))
     assert frequency == pytest.approx(1.0, abs=0.03)
 
 

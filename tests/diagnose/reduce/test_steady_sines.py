@@ -101,7 +101,8 @@ def test_finds_a_line_whose_phase_wanders():
     assert sines["sine_resolution"][place] > 2.0 * RATE / SIZE  # seen in the parts of the record
 
 
-def test_amplitude_has_the_error_it_states():
+@pytest.mark.parametrize("lost", ["none", "scattered", "stretches"])
+def test_amplitude_has_the_error_it_states(lost):
     rng = np.random.default_rng(4)
     amplitude, errors = np.sqrt(4.0 * 60.0 / SIZE), []
     for _ in range(60):
@@ -109,6 +110,10 @@ def test_amplitude_has_the_error_it_states():
         noise = rng.standard_normal((1, SIZE)) + wave(
             frequency, amplitude, phase=rng.uniform(0.0, 6.0)
         )
+        if lost == "scattered":
+            noise[:, rng.random(SIZE) < 0.4] = np.nan
+        elif lost == "stretches":
+            noise[:, 2000:5000] = noise[:, 9000:9600] = np.nan
         sines = search(noise)
         place = int(sines["sine_nats"][0].argmax())
         square, stderr = sines["sine_square"][0, place], sines["sine_square_stderr"][0, place]
