@@ -121,6 +121,20 @@ def test_angle_quantization_is_noise_and_not_an_effect():
     np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_amplitude_of_a_line_is_that_before_the_samples_average_it(seed):
+    scenario = draw_scenario(np.random.default_rng(0), rate=10.0, seconds=600.0)
+    rng = np.random.default_rng(seed)
+    effect = CATALOGUE["spectral_line"].make(scenario, rng, strength=8.0)
+    amplitude = effect.parameters["amplitude"]["values"]
+    frequency = effect.parameters["frequency"]["value"]
+    phases = 2.0 * math.pi * frequency / scenario.rate * np.linspace(-0.5, 0.5, 10_001)
+    passed = np.cos(phases).mean()  # of a sine, averaged over a sample
+    for axis, size in amplitude.items():
+        largest = np.abs(effect.mean[AXES.index(axis)]).max()
+        assert largest == pytest.approx(size * passed, rel=0.01)
+
+
 def test_dead_zone_leaves_zeros():
     log, truth = make_case(small("dead_zone", strength=6.0))
     row = log.rate.sel(axis=truth["effects"][0]["axes"][0]).values

@@ -64,7 +64,8 @@ def spectral_line(scenario: Scenario, rng: np.random.Generator, *, strength: flo
             }
         },
     )
-    amplitude = float(effect.parameters["peak"]["value"])
+    # A diagnosis states the amplitude of a sine whose means over the samples these values are.
+    amplitude = float(effect.parameters["peak"]["value"]) / np.sinc(frequency / scenario.rate)
     effect.parameters["amplitude"] = {
         "values": scale_by_axis(np.abs(shares), amplitude),
         "unit": "deg/h",
