@@ -70,10 +70,10 @@ class TemperatureNoise(Effect):
     size_parameters = ("linear", "quadratic")
 
     linear: float = parameter(
-        "1/degC", "growth of N^2 per degree, as a share of it", typical=2e-3, low=-1.0, high=10.0
+        "1/degC", "growth of N^2 per degree, as a share of it", typical=2e-3, limit=1e3
     )
     quadratic: float = parameter(
-        "1/degC^2", "the same per degree squared", default=0.0, typical=1e-5, limit=1.0
+        "1/degC^2", "the same per degree squared", default=0.0, typical=1e-5, limit=1e3
     )
     reference: float = parameter(
         "degC", "temperature of the model's N", default=25.0, low=-273.15, high=500.0

@@ -37,6 +37,17 @@ def test_squared_noise_is_a_polynomial_of_temperature():
     np.testing.assert_allclose(squares, [[0.01, 0.01, 0.01, 0.0001, 0.01]] * 3, rtol=1e-12)
 
 
+def test_law_about_a_far_reference_is_that_about_the_recorded_temperatures():
+    """Between 35 and 38 degrees, the law is known and positive; at 25 degrees neither."""
+    far = make_effect({"name": "temperature_noise", "linear": -4.2, "quadratic": 0.21})
+    near = far.refer_noise_to({"temperature": 36.0})
+    degrees = np.array([35.0, 36.0, 37.0, 38.0])
+    law = 1.0 - 4.2 * (degrees - 25.0) + 0.21 * (degrees - 25.0) ** 2
+    noise = {"Q": 0.0, "N": 0.1, "B": 0.0, "K": 0.0}
+    squares = run(near, size=4, drivers={"temperature": degrees}, noise=noise)["N"][0]
+    np.testing.assert_allclose(squares, 0.01 * (1.0 + law - law[1]), rtol=1e-9)
+
+
 def test_squared_noise_is_that_of_a_detector_in_weak_light():
     power = np.array([1e-4, 5e-5, 2e-5, 1e-5, 1e-3])
     thermal, shot, excess = 3e-12, 2e-8, 1e-3  # N^2 = thermal / P^2 + shot / P + excess
