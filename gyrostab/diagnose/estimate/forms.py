@@ -9,7 +9,8 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.identify.identification import Identifications, Selection
-from gyrostab.diagnose.predict.candidates import Component, Variant
+from gyrostab.diagnose.predict.average_sizes import choose_grid
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.grid_refinement import Point, refine_grid
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
@@ -19,8 +20,9 @@ from gyrostab.physics.registry import effects
 def settle_forms(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
     """Return identifications with the forms that their models will have.
 
-    Each component has a single term where that explains as much, and all components of an effect
-    have the same choice of each parameter that is a text. Noise that is calibrated with another
+    Each component has a single term where that explains as much, and the exponent that its sizes
+    are estimated with. All components of an effect have the same choice of each parameter that is a
+    text. Noise that is calibrated with another
     form than the model has does not belong to that model.
     """
 
@@ -29,7 +31,10 @@ def settle_forms(identifications: Identifications, baseline: xr.Dataset) -> Iden
         components = _share_choices(identification.components, state)
         return replace(
             identification,
-            components=tuple(prefer_plainer(component, state) for component in components),
+            components=tuple(
+                _choose_variant(prefer_plainer(component, state), state, identifications.candidates)
+                for component in components
+            ),
         )
 
     return replace(
@@ -86,6 +91,18 @@ def _select_texts(component: Component, state: State, texts: Mapping[str, str]) 
         component,
         variant=max(variants, key=lambda variant: _explained_nats(component, state, variant)),
     )
+
+
+def _choose_variant(
+    component: Component, state: State, candidates: Sequence[Candidate]
+) -> Component:
+    """Return a component in its own variant, or in the best of those that its sizes are from."""
+    if component.is_filter or component.is_step or not _has_forms(component):
+        return component
+    grid = choose_grid(component, state, candidates)
+    if any(point.variant is component.variant for point in grid):
+        return component
+    return replace(component, variant=max(grid, key=lambda point: point.evidence).variant)
 
 
 def _has_forms(component: Component) -> bool:

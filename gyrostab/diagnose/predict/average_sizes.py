@@ -57,17 +57,7 @@ def average_sizes(
         Sizes at the likeliest point of the grid, and that point. These values belong together;
         sizes at some value of a nuisance parameter may be far from the effect with both averages.
     """
-    grid = [
-        Point(variant, component_mixture(component, state, variant))
-        for variant in _variant_family(component, candidates)
-    ]
-    # the plain variants, unless others are clearly better
-    family = [point.variant for point in grid]
-    plain = [grid[place] for place in plain_places(component.candidate.effect, family)]
-    top = max(point.evidence for point in grid)
-    if any(point.evidence > top - state.settings.ambiguous_nats for point in plain):
-        grid = plain
-    points = refine_grid(component, state, grid)
+    points = refine_grid(component, state, choose_grid(component, state, candidates))
     family = [point.variant for point in points]
     evidence = np.array([point.evidence for point in points])
     merged = _merge_points(points)
@@ -118,6 +108,22 @@ def average_sizes(
     at_best = max(without_lag or range(len(points)), key=lambda place: evidence[place])
     best, _ = points[at_best].sizes.moments()
     return mean, covariance, ends, nuisance, (best, family[at_best])
+
+
+def choose_grid(component: Component, state: State, candidates: Sequence[Candidate]) -> list[Point]:
+    """Return the grid that the sizes of a component are averaged over.
+
+    It has the plain variants alone (`plain_places`), unless others are clearly better.
+    """
+    grid = [
+        Point(variant, component_mixture(component, state, variant))
+        for variant in _variant_family(component, candidates)
+    ]
+    family = [point.variant for point in grid]
+    plain = [grid[place] for place in plain_places(component.candidate.effect, family)]
+    top = max(point.evidence for point in grid)
+    is_plain = any(point.evidence > top - state.settings.ambiguous_nats for point in plain)
+    return plain if is_plain else grid
 
 
 def _size_interval(mean: Array, covariance: Array, supported: Sequence[Mixture]) -> Array:
