@@ -158,22 +158,15 @@ def scale_to_quiescent(
     SchemaError
         If an axis has no spectrum in its quiescent blocks.
     """
-    power, shape = (blocks[name].values for name in ("power", "shape"))
-    common, shape_alone = common_variance(blocks)
     factors, scaled, sizes = [], [], []
     for row, (axis, posterior) in enumerate(zip(blocks["axis"].values, posteriors, strict=True)):
-        good = np.isfinite(power[row]) & np.isfinite(shape[row]) & quiet[row][:, None]
-        good &= noise[row] > 0.0
-        if not good.any():
+        fitted = fit_noise_factor(blocks.isel(axis=[row]), noise[row], added[row], quiet[row])
+        if fitted is None:
             raise SchemaError(
                 f"axis {axis}: the quiescent blocks hold no spectrum to calibrate the simulation "
                 "on; give other stretches with --quiet, or none, to take the simulation as it is"
             )
-        separate_shape = np.where(good, shape_alone[row], 0.0).sum(axis=1)
-        # see `common_variance`
-        reduction = 1.0 / (1.0 + np.where(quiet[row], common[row], 0.0) * separate_shape)
-        weight = (shape[row] * np.broadcast_to(reduction[:, None], good.shape))[good]
-        factor, error = _fit_factor(power[row][good], noise[row][good], added[row][good], weight)
+        factor, error = fitted
         factors.append(factor)
         sizes.append(f"{math.sqrt(factor):.3g} on axis {axis}")
         rng = np.random.default_rng(row)
@@ -195,6 +188,26 @@ def scale_to_quiescent(
         stacklevel=2,
     )
     return scaled, np.array(factors)
+
+
+def fit_noise_factor(
+    blocks: xr.Dataset, noise: Array, added: Array, chosen: NDArray[np.bool_]
+) -> tuple[float, float] | None:
+    """Fit a factor of the noise (block, band) of a single axis to the powers of chosen blocks.
+
+    `added` is the power that effects add. Return the factor with the largest gamma likelihood, and
+    the share of its error; None without any spectrum.
+    """
+    power, shape = (blocks[name].values[0] for name in ("power", "shape"))
+    common, shape_alone = (values[0] for values in common_variance(blocks))
+    good = np.isfinite(power) & np.isfinite(shape) & chosen[:, None] & (noise > 0.0)
+    if not good.any():
+        return None
+    separate_shape = np.where(good, shape_alone, 0.0).sum(axis=1)
+    # see `common_variance`
+    reduction = 1.0 / (1.0 + np.where(chosen, common, 0.0) * separate_shape)
+    weight = (shape * np.broadcast_to(reduction[:, None], good.shape))[good]
+    return _fit_factor(power[good], noise[good], added[good], weight)
 
 
 def _fit_factor(power: Array, noise: Array, added: Array, weight: Array) -> tuple[float, float]:

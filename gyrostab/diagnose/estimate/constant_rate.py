@@ -1,18 +1,22 @@
-"""Estimate the constant rate and the noise of each axis before effects on single samples."""
+"""Estimate the constant rate and the noise of each axis of a model with its effects."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.expected_statistics import PassedNoise, undo_transfer
+from gyrostab.diagnose.baseline.expected_statistics import NOISE, PassedNoise, undo_transfer
+from gyrostab.diagnose.baseline.from_model import fit_noise_factor
+from gyrostab.diagnose.baseline.known_effects import expect_known_effects
 from gyrostab.diagnose.predict.windows import predict_effect
 from gyrostab.diagnose.reduce.schema import weighted_mean
 from gyrostab.physics.base import Effect
+from gyrostab.simulate.model import read_model
 from gyrostab.units import HOUR
 
 Array = NDArray[np.float64]
@@ -77,6 +81,44 @@ def undo_noise_loss(
         terms["N"] = float(f"{math.sqrt(max(terms['N'] ** 2 + lost / (HOUR * rate), 0.0)):.6g}")
         for term in ("B", "K"):
             terms[term] = float(f"{terms[term] / max(passed.gain, _MIN_GAIN):.6g}")
+    return out
+
+
+def fit_white_noise(
+    tables: Mapping[str, Any], baseline: xr.Dataset, blocks: xr.Dataset
+) -> dict[str, float]:
+    """Return N of each recalibrated axis [degree hour-1/2] with the effects at their final sizes.
+
+    The noise was calibrated with sizes that are free. The final ones, averaged over lags and noise,
+    add another power, as would noise that is referred to a temperature far from the recorded ones.
+
+    Parameters
+    ----------
+    tables : mapping
+        Those of the model.
+    baseline : xarray.Dataset
+        The baseline with the noise of the model; its recalibrated axes have their blocks in
+        ``quiet``.
+    """
+    model = read_model(dict(tables))
+    axes = [str(axis) for axis in blocks["axis"].values]
+    coefficients = [model.coefficients(axis) for axis in axes]
+    square = np.array([[of_axis[term] ** 2 for term in NOISE] for of_axis in coefficients])
+    white = NOISE.index("N")
+    others = square.copy()
+    others[:, white] = 0.0
+    spectrum, added = (
+        expect_known_effects(blocks, model, part).spectrum for part in (square, others)
+    )
+    out = {}
+    for row, axis in enumerate(axes):
+        if axis not in baseline.attrs["recalibrated"]:
+            continue
+        chosen = baseline["quiet"].values[row]
+        noise = spectrum[row] - added[row]
+        fitted = fit_noise_factor(blocks.isel(axis=[row]), noise, added[row], chosen)
+        if fitted is not None:
+            out[axis] = math.sqrt(square[row, white] * fitted[0])
     return out
 
 

@@ -11,7 +11,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.estimate.constant_rate import constant_rates, undo_noise_loss
+from gyrostab.diagnose.estimate.constant_rate import (
+    constant_rates,
+    fit_white_noise,
+    undo_noise_loss,
+)
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.components import are_lines
 from gyrostab.diagnose.identify.identification import Identifications
@@ -214,9 +218,13 @@ def model_tables(
     band = own.flicker_band if own is not None else Model.flicker_band
     flicker = {"flicker_band": list(band)} if band != Model.flicker_band else {}
     rates = constant_rates(blocks, [*given_effects, *added_effects], turning)
-    return {
+    tables = {
         **log,
         "noise": {**flicker, **noise},
         "bias": {axis: float(f"{rate:.6g}") for axis, rate in rates.items()},
         "effect": [effect_table(effect) for effect in [*given_effects, *added_effects]],
     }
+    if baseline.attrs.get("recalibrated"):
+        for axis, size in fit_white_noise(tables, baseline, blocks).items():
+            tables["noise"][axis]["N"] = float(f"{size:.6g}")
+    return tables
