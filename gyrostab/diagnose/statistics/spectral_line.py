@@ -22,7 +22,14 @@ from gyrostab.diagnose.predict.candidates import (
     Variant,
 )
 from gyrostab.diagnose.predict.condition import bands_at, free_covariance
-from gyrostab.diagnose.predict.linear_model import State, unspread_share_of_lines
+from gyrostab.diagnose.predict.linear_model import (
+    State,
+    average_in_bands,
+    band_widths,
+    mix_with_mean,
+    unspread_share,
+    unspread_share_of_lines,
+)
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.diagnose.reduce.schema import axis_values
@@ -147,6 +154,26 @@ class SpectralLine(Statistic):
             state = free_covariance(state, (axis,), column)
         skirt = line_skirt(state.blocks, axis, component.place, state.settings)
         return state.with_columns("line", "all", [skirt])
+
+    def noise_shares(
+        self, component: Component, axis: str, state: State, weight: Array
+    ) -> tuple[Array | float, list[Array], list[Array]]:
+        """Return the power of the line and its skirt above the spectrum around them.
+
+        The power of the bands of a resonance is free: its slopes are not known.
+        """
+        blocks, place = state.blocks, component.place
+        if place < 0 or math.isfinite(line_quality(blocks, state.baseline, axis, place)):
+            return super().noise_shares(component, axis, state, weight)
+        total, _ = mean_line_power(blocks, axis)
+        skirt = line_skirt(blocks, axis, place, state.settings)
+        above = np.where(skirt, total - local_level(total), 0.0)
+        row = state.axes.index(axis)
+        density = np.maximum(average_in_bands(above, blocks), 0.0)
+        share = unspread_share_of_lines(blocks)[row]
+        return mix_with_mean(
+            density / share, unspread_share(blocks)[row], band_widths(blocks)
+        ), [], []
 
     def is_only_in_phase(self, component: Component, blocks: xr.Dataset) -> bool:
         """Return whether the component is a sine below two cycles a block, of constant phase.

@@ -10,6 +10,7 @@ import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import assemble_baseline, calibrate_axes, calibrate_noise
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
+from gyrostab.diagnose.estimate.constant_rate import fit_white_noise
 from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
@@ -24,7 +25,7 @@ from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.physics.electronics import GaussMarkov
 from gyrostab.simulate import simulate
-from tests.support.candidates import identify_by_hand, make_identifications
+from tests.support.candidates import identify_by_hand, make_identifications, select_candidate
 
 NOISE = {"N": 0.003, "B": 0.004, "K": 0.02}
 HEAT = {"profile": "ramps", "channel": "temperature", "unit": "degC"}
@@ -121,6 +122,62 @@ def test_noise_is_that_of_the_form_in_the_model():
     mean = float(blocks["channel_temperature"].mean()) - 25.0
     level = noise_coefficient(fit.noise, "N")[0] ** 2 * (1.0 + size.value * mean)
     assert level == pytest.approx(noise_coefficient(baseline, "N")[0] ** 2, rel=0.03)
+
+
+def test_noise_belongs_to_the_exponent_in_the_model():
+    """The evidence prefers the root of the time; the model has the usual proportional growth."""
+    blocks = reduce_simulation({"name": "ageing_noise", "growth": 20.0, "axes": ["x"]})
+    baseline = calibrate_noise(blocks)
+    by_evidence = identify_by_hand(
+        blocks, baseline, "ageing_noise", "power", ("growth",), exponent=0.5
+    )
+    identifications = settle_forms(by_evidence, baseline)
+    (component,) = identifications.identified[0].components
+    assert component.variant.values["exponent"] == 1.0
+    first = fit_identifications(identifications, baseline)
+    fit = conclude.refit_with_noise(identifications, baseline, first)
+    value, error = noise_coefficient(fit.noise, "N")
+    assert abs(value - 0.003) < 3.0 * error
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.3])
+def test_lines_in_most_bands_leave_the_noise_between_them(lost):
+    """The power of a steady line stands out from the lines beside it; that of its band is free."""
+    places = [0.42, 0.58, 0.85, 1.31, 2.12, 3.2, 4.2, 4.7]
+    lines = [
+        {"name": "spectral_line", "amplitude": 0.3, "frequency": place, "axes": ["x"]}
+        for place in places
+    ]
+    blocks = reduce_simulation(*lines, lost=lost)
+    baseline = calibrate_noise(blocks)
+    candidates, _ = effect_candidates(blocks, baseline["coefficient"])
+    candidate = select_candidate(candidates, "spectral_line", "spectral_line")
+    frequency = blocks["line_frequency"].values
+    components = tuple(
+        Component(
+            candidate, candidate.variants[0], ("x",), 100.0, int(np.abs(frequency - place).argmin())
+        )
+        for place in places
+    )
+    selection = Selection("spectral_line", (), ("x",), components, 1200.0, 8.0)
+    state = condition_on(initial_state(blocks, baseline), list(components))
+    identifications = make_identifications([selection], state)
+    after = recalibrate(identifications, baseline, [])
+    assert noise_coefficient(baseline, "N")[0] > 1.3 * 0.003
+    value, error = noise_coefficient(after, "N")
+    assert value == pytest.approx(0.003, rel=0.05)
+    assert error < 0.05 * 0.003
+
+
+def test_white_noise_of_a_model_gives_the_power_of_the_record_with_its_effects():
+    heat = HEAT | {"points": [[0, 45], [1800, 65]]}
+    table = {"name": "temperature_noise", "linear": 0.03, "axes": ["x"]}
+    blocks = reduce_simulation(table, environment=[heat], lost=0.2)
+    wrong = {axis: NOISE | {"N": 0.0036} for axis in "xy"}
+    baseline = calibrate_noise(blocks).assign_attrs(recalibrated=["x"])
+    baseline["quiet"][:] = True
+    white = fit_white_noise({"noise": wrong, "effect": [table]}, baseline, blocks)
+    assert white == pytest.approx({"x": 0.003}, rel=0.02)
 
 
 def test_noise_that_changes_far_from_its_reference_has_the_level_of_the_record():
