@@ -218,7 +218,7 @@ def model_tables(
     band = own.flicker_band if own is not None else Model.flicker_band
     flicker = {"flicker_band": list(band)} if band != Model.flicker_band else {}
     rates = constant_rates(blocks, [*given_effects, *added_effects], turning)
-    tables = {
+    tables: dict[str, Any] = {
         **log,
         "noise": {**flicker, **noise},
         "bias": {axis: float(f"{rate:.6g}") for axis, rate in rates.items()},

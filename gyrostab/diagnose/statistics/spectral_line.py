@@ -171,9 +171,8 @@ class SpectralLine(Statistic):
         row = state.axes.index(axis)
         density = np.maximum(average_in_bands(above, blocks), 0.0)
         share = unspread_share_of_lines(blocks)[row]
-        return mix_with_mean(
-            density / share, unspread_share(blocks)[row], band_widths(blocks)
-        ), [], []
+        power = mix_with_mean(density / share, unspread_share(blocks)[row], band_widths(blocks))
+        return power, [], []
 
     def is_only_in_phase(self, component: Component, blocks: xr.Dataset) -> bool:
         """Return whether the component is a sine below two cycles a block, of constant phase.
