@@ -116,15 +116,17 @@ def declare_counts(dtype: Any, scale: float) -> dict[str, Any]:
 
 
 def pack_counts(reach: float, scale: float) -> dict[str, Any]:
-    """Return the encoding of integer counts up to `reach`; empty if they exceed 32 bits.
+    """Return the encoding of integer counts up to `reach`; without a type if they exceed 32 bits.
+
+    Counts without a type are stored as doubles.
 
     Examples
     --------
     >>> pack_counts(40_000, 0.1)["dtype"], pack_counts(1e10, 0.1)
-    (dtype('int32'), {})
+    (dtype('int32'), {'scale_factor': 0.1})
     """
     dtype = next((kind for kind in ("int16", "int32") if reach < np.iinfo(kind).max), None)
-    return declare_counts(dtype, scale) if dtype else {}
+    return declare_counts(dtype, scale) if dtype else {"scale_factor": float(scale)}
 
 
 def common_packing(encodings: Iterable[Mapping[Any, Any]]) -> dict[str, Any]:
@@ -140,8 +142,10 @@ def common_packing(encodings: Iterable[Mapping[Any, Any]]) -> dict[str, Any]:
     encodings = list(encodings)
     scales = {encoding.get("scale_factor") for encoding in encodings}
     scale = scales.pop() if len(scales) == 1 else None
-    if scale is None or not all("dtype" in encoding for encoding in encodings):
+    if scale is None:
         return {}
+    if not all("dtype" in encoding for encoding in encodings):
+        return {"scale_factor": float(scale)}
     dtypes = (np.dtype(encoding["dtype"]) for encoding in encodings)
     return declare_counts(np.result_type(*dtypes), scale)
 

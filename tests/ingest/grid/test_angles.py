@@ -51,7 +51,9 @@ def test_wrapped_angle_with_lost_rows_is_continued(tmp_path):
     np.testing.assert_allclose((read - read[0])[found], angle[kept] - angle[kept[0]], atol=1e-6)
 
 
-@pytest.mark.parametrize(("bits", "low"), [(16, 0), (16, -(2**15)), (24, 0), (32, -(2**31))])
+@pytest.mark.parametrize(
+    ("bits", "low"), [(16, 0), (16, -(2**15)), (24, 0), (32, -(2**31)), (32, 0)]
+)
 def test_counter_that_is_full_is_continued(tmp_path, bits, low):
     counts = np.rint(make_angle(15 / 3600) / 0.01 * 3600)
     counts += low + 2**bits - counts[5000] + 20
