@@ -22,6 +22,9 @@ _MIN_PERIOD = 16.0
 #: Shortest step that is a jump [usual steps], and the longest time between two rows over which a
 #: counter that was set to zero is continued [usual times].
 _MIN_JUMP, _MAX_PAUSE = 100.0, 2.0
+#: Largest motion of a wrapped angle over missing samples, in periods and at its usual steps, at
+#: which the nearest turn is taken: it may move twice as fast.
+_MAX_UNSEEN = 0.25
 
 Floats = NDArray[np.float64]
 
@@ -43,6 +46,10 @@ class TurningAngle:
         self.counters = [] if count is None else [size * abs(count) for size in _COUNTERS]
         self.last: tuple[float, int] | None = None  # angle as it is written [degree], stamp [ns]
         self.low, self.high = np.inf, -np.inf
+        self.period, self.usual = (
+            np.inf,
+            0.0,
+        )  # infinite without a turn; largest usual step [degree]
         self.first = 0  # row of the next block
         #: Rows from which on angles [degree] are added, and rows of jumps that are not explained.
         self.rows: list[int] = []
@@ -84,6 +91,10 @@ class TurningAngle:
         added = np.where(
             is_reset, written - steps, -np.sign(steps) * (period if is_turn.any() else 0.0)
         )
+        motion = (sizes / np.maximum(waits, 1.0))[(sizes > 0) & ~is_turn]
+        self.usual = max(self.usual, float(np.quantile(motion, 0.9)) if motion.size else 0.0)
+        if is_turn.any():
+            self.period = period
         is_found = is_turn | is_reset
         self.rows += rows[is_found].tolist()
         self.added += added[is_found].tolist()
@@ -117,11 +128,14 @@ def _pack_continued(encoding: dict[Any, Any], turns: list[TurningAngle]) -> dict
     return pack_counts(reach / count, count)
 
 
-def continue_angles(raw: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
-    """Continue the cumulative angles of a raw log where they begin again, and return notes.
+def continue_angles(raw: xr.Dataset) -> tuple[xr.Dataset, list[str], float]:
+    """Continue the cumulative angles of a raw log where they begin again.
 
     An angle that wraps around (360 degree) or a counter of 16, 24 or 32 bits that is full gets its
     period, and a counter that was set to zero the angle that it had.
+
+    Returns the raw log, notes, and the steps between samples over which the number of turns is
+    known.
     """
     variable = raw["angle"]
     count = variable.encoding.get("scale_factor")
@@ -144,9 +158,37 @@ def continue_angles(raw: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
                 places = "1 place" if len(rows_of) == 1 else f"{len(rows_of)} places"
                 notes.append(f"{file}: the angle of axis {axis} {text}: {places}, first row {row}")
     if not any(turn.rows for turn in turns):
-        return raw, notes
+        return raw, notes, np.inf
+    moving = [turn for turn in turns if turn.usual > 0]
+    known_steps = min((_MAX_UNSEEN * turn.period / turn.usual for turn in moving), default=np.inf)
     source = _Continued(variable.data, turns)
     is_plain = isinstance(variable.data, np.ndarray)
     data = source[:, :] if is_plain else make_dask(source, variable.chunks)
     packing = _pack_continued(variable.encoding, turns)
-    return raw.assign(angle=(variable.dims, data, variable.attrs, packing)), notes
+    return raw.assign(angle=(variable.dims, data, variable.attrs, packing)), notes, known_steps
+
+
+class _Differences(RowSource):
+    """Angles less those of the sample before, times a factor; NaN for the first sample."""
+
+    dtype = np.dtype(np.float64)
+
+    def __init__(self, array: Any, factor: float):
+        self.parts, self.shape, self.factor = (array,), array.shape, factor
+
+    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+        angles = np.full(out.size + 1, np.nan)
+        read_into(self.parts[0], row, max(begin - 1, 0), angles[int(begin == 0) :])
+        np.multiply(np.diff(angles), self.factor, out=out)
+
+
+def differentiate_angles(angles: Any, factor: float) -> Any:
+    """Return the steps of angles (axis, sample) since the sample before, times a factor.
+
+    Examples
+    --------
+    >>> differentiate_angles(np.array([[1.0, 3.0, np.nan, 8.0, 9.0]]), 10.0)
+    array([[nan, 20., nan, nan, 10.]])
+    """
+    source = _Differences(angles, factor)
+    return source[:, :] if isinstance(angles, np.ndarray) else make_dask(source, angles.chunks)

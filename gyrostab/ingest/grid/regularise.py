@@ -18,13 +18,29 @@ from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.concat.core import concatenate_logs
 from gyrostab.ingest.concat.grid import split_axes
 from gyrostab.ingest.concat.lazy import place_array
-from gyrostab.ingest.gap_table import gap_variables, name_lost, sort_gaps
-from gyrostab.ingest.grid.angles import continue_angles
+from gyrostab.ingest.gap_table import (
+    CAUSE,
+    CLOCK_STEP,
+    END,
+    FIRST,
+    MISSING,
+    SAMPLES,
+    gap_variables,
+    name_lost,
+    sort_gaps,
+)
+from gyrostab.ingest.grid.angles import continue_angles, differentiate_angles
 from gyrostab.ingest.grid.gaps import find_gaps
 from gyrostab.ingest.grid.notes import describe_angles, describe_channels, describe_placement
 from gyrostab.ingest.grid.place import Placement, check_grid
 from gyrostab.ingest.grid.place_rows import RowPlacer
-from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, scan_rows
+from gyrostab.ingest.grid.scan_pass import (
+    BLOCK_ROWS,
+    ScanPass,
+    file_of,
+    record_name,
+    scan_rows,
+)
 from gyrostab.ingest.limits import check_limits
 from gyrostab.ingest.uniform import as_uniform, check_same_rate
 from gyrostab.kernels.grid.stamps import NO_STAMP, RESTART, STEP
@@ -109,6 +125,24 @@ def _log_attributes(
     }
 
 
+def _has_unknown_turns(table: NDArray[np.int64], known_steps: float) -> bool:
+    """Return whether a gap is longer than the steps over which the turns of angles are known."""
+    lengths = np.where(
+        np.isin(table[:, CAUSE], (CLOCK_STEP, RESTART)), np.inf, table[:, END] - table[:, FIRST]
+    )
+    return bool(lengths.max(initial=0.0) + 1 > known_steps)
+
+
+def _end_gaps_later(table: NDArray[np.int64], size: int) -> NDArray[np.int64]:
+    """Return a table of gaps of steps since the sample before, which the first sample lacks."""
+    later = np.concatenate([[[0, 0, 0, 0, MISSING]], table])
+    is_gap = later[:, END] > later[:, FIRST]
+    is_gap[0] = True
+    later[is_gap, END] = np.minimum(later[is_gap, END] + 1, size)
+    later[is_gap, SAMPLES] = (later[:, END] - later[:, FIRST])[is_gap]
+    return later
+
+
 def _describe_axes(
     axis_rows: Sequence[Any], parts: Sequence[xr.Dataset], logs: Sequence[xr.Dataset]
 ) -> tuple[list[str], str]:
@@ -174,7 +208,8 @@ def regularise(
     Notes
     -----
     Angle increments (kind "increment") become the mean rate over their sampling interval, increment
-    times sampling rate.
+    times sampling rate. The steps of cumulative angles that wrap around become rates too, if a gap
+    may hold more than half a turn.
 
     Examples
     --------
@@ -206,9 +241,9 @@ def regularise(
     gap_limit = duration_seconds(max_gap, "max_gap")
     name = signal_name(raw)
     allowed = check_limits(limits)
-    turns: list[str] = []
+    turns, known_steps = list[str](), np.inf
     if name == "angle" and raw.attrs.get("kind") == "angle":
-        raw, turns = continue_angles(raw)
+        raw, turns, known_steps = continue_angles(raw)
     scanned = scan_rows(raw, name)
     given = rate if rate is not None else raw.attrs.get("declared_rate_hz")
     declared = None if given is None else float(given)
@@ -225,19 +260,24 @@ def regularise(
         notes += [*turns, *describe_angles(raw)]
 
     increments = raw.attrs.get("kind") == "increment"
-    signal = "rate" if increments else name
-    scale = hertz * HOUR if increments else 1.0  # degree a sample to degree an hour
-    attributes = {**raw[name].attrs, "units": SIGNAL_UNITS[signal]}
+    to_rate = hertz * HOUR  # degree a sample to degree an hour
+    scale = to_rate if increments else 1.0
     unit = raw[name].encoding.get("scale_factor")
+    data = rows_on_grid(raw[name].data, placement, chunk=chunk, scale=scale, unit=unit)
     packing = {**raw[name].encoding, "scale_factor": unit * scale} if unit else {}
+    signal = "rate" if increments else name
+    if _has_unknown_turns(table, known_steps):
+        data, packing, signal = differentiate_angles(data, to_rate), {}, "rate"
+        table = _end_gaps_later(table, placement.size)
+        notes.append(
+            f"{record_name(raw)}: an angle wraps around, and how often it does while samples are "
+            "missing is not known; so the log holds rates, each the mean since the sample before, "
+            "and none directly after missing samples"
+        )
+    attributes = {**raw[name].attrs, "units": SIGNAL_UNITS[signal]}
     variables, channel_times = _place_channels(raw, scanned, placement, hertz, chunk)
     variables = {
-        signal: (
-            ("axis", "time"),
-            rows_on_grid(raw[name].data, placement, chunk=chunk, scale=scale, unit=unit),
-            attributes,
-            packing,
-        ),
+        signal: (("axis", "time"), data, attributes, packing),
         **variables,
         **gap_variables(sort_gaps(table), placement.start, hertz),
     }

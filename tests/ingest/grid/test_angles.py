@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.ingest.reading import read_log
 
@@ -42,13 +43,34 @@ def test_wrapped_angle_is_continued(tmp_path, monkeypatch, block, low, turning, 
     assert any("is continued" in note for note in log.attrs["notes"]) == is_continued
 
 
-def test_wrapped_angle_with_lost_rows_is_continued(tmp_path):
-    angle = make_angle(30.0)
+@pytest.mark.parametrize("block", [7, 2**20])
+def test_wrapped_angle_with_lost_rows_is_continued(tmp_path, monkeypatch, block):
+    monkeypatch.setattr("gyrostab.ingest.grid.angles.BLOCK_ROWS", block)
+    angle = make_angle(30.0, 4000)
     kept = np.flatnonzero(np.random.default_rng(1).random(angle.size) > 0.3)
     kept = kept[(kept < 1000) | (kept > 1100)]
     _, read = read_angle(tmp_path, angle % 360, kept=kept)
     found = np.isfinite(read)
     np.testing.assert_allclose((read - read[0])[found], angle[kept] - angle[kept[0]], atol=1e-6)
+
+
+@pytest.mark.parametrize("most_in_memory", [2_000_000, 1000])
+@pytest.mark.parametrize("pause", [1.0, 7.0, -100.0])
+def test_unknown_turns_in_a_pause_are_missing_rates(tmp_path, monkeypatch, pause, most_in_memory):
+    monkeypatch.setattr("gyrostab.ingest.grid.regularise.MAX_PLAIN_NUMBERS", most_in_memory)
+    rows, turning = np.arange(20_000), -300.0
+    times = rows / RATE + 1000 + np.where(rows >= 12_000, pause, 0.0)
+    cells = {"time [s]": times, "angle_x [deg]": (turning * times + 0.3) % 360}
+    pd.DataFrame(cells).to_csv(tmp_path / "log.csv", index=False)
+    log = regularise(read_log(tmp_path / "log.csv", kind="angle"))
+    missing = 1 if pause < 0 else round(pause * RATE)
+    expected = np.full(rows.size + missing, turning * 3600)
+    expected[[0, *range(12_000, 12_001 + missing)]] = np.nan
+    np.testing.assert_allclose(log.rate.values[0], expected, rtol=1e-6)
+    assert log.attrs["kind"] == "rate"
+    assert gap_table(log).samples.tolist() == [1, missing + 1]
+    (note,) = [note for note in log.attrs["notes"] if "so the log holds rates" in note]
+    assert note.startswith("log.csv: an angle wraps around")
 
 
 @pytest.mark.parametrize(
