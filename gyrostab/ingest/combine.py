@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
 from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Spool
-from gyrostab.ingest.columns.stamps import NAT, read_stamps
+from gyrostab.ingest.columns.stamps import CLOCK_PERIODS, NAT, read_stamps, typical_step
 from gyrostab.ingest.concat.core import absence_notes, check_units, merge_notes
 from gyrostab.ingest.concat.grid import group_axes, split_axes
 from gyrostab.ingest.concat.place import COMPARED_SAMPLES, match_ends
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import (
     concatenate_columns,
+    convert_lazy,
     make_dask,
     read_slice,
     select_part,
@@ -27,7 +28,7 @@ from gyrostab.store.lazy import (
 from gyrostab.store.write import common_packing
 from gyrostab.wording import list_some
 
-_BLOCK_ROWS = 2**20
+_BLOCK_ROWS, _FIRST_ROWS = 2**20, 2**12
 
 
 def memory_bytes(part: xr.Dataset) -> int:
@@ -53,6 +54,59 @@ def move_to_disk(part: xr.Dataset, spool: Spool) -> xr.Dataset:
 
     columns = _columns_in_memory(part).items()
     return part.assign({name: (v.dims, moved(v), v.attrs, v.encoding) for name, v in columns})
+
+
+def continue_clocks(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
+    """Continue a clock that begins again from one file to the next, with notes.
+
+    The raw logs are in the order of their names. They stay unchanged unless each one then begins
+    after the end of the one before.
+    """
+    continued: list[xr.Dataset] = []
+    added, end, typical = 0, 0, 0.0
+    for part in parts:
+        first, last = stamp_span(part) if "clock_zero" in part.attrs else (0, NAT)
+        if last == NAT:
+            return list(parts)
+        if continued and first + added < end:
+            period, turns = _find_turns(
+                first + added - end, first - part.attrs["clock_zero"], typical
+            )
+            if not turns:
+                return list(parts)
+            added += turns * period
+            note = (
+                f"{part.attrs['source_files'][0]}: the clock begins again after "
+                f"{CLOCK_PERIODS[period]} without a pause; the stamps are continued from the file "
+                "before"
+            )
+            part = part.assign_attrs(notes=[*part.attrs["notes"], note])
+        end, typical = last + added, typical_step(read_stamps(part, 0, _FIRST_ROWS))
+        continued.append(_move_stamps(part, added) if added else part)
+    return continued
+
+
+def _find_turns(step: int, first: int, typical: float) -> tuple[int, int]:
+    """Return the period of a clock and the number of periods that it was set back, or 0.
+
+    `first` is the stamp after the step, from the zero of the clock.
+    """
+    for period in CLOCK_PERIODS:
+        turns, rest = -(step // period), step % period
+        if 0 < rest <= 2 * typical < period / 2 and -period / 2 <= first < period:
+            return period, turns
+    return 0, 0
+
+
+def _move_stamps(part: xr.Dataset, added: int) -> xr.Dataset:
+    """Add a time [ns] to the stamps of a raw log."""
+
+    def move(stamps: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray(stamps + np.timedelta64(added, "ns"))
+
+    data = part["time"].data
+    moved = move(data) if isinstance(data, np.ndarray) else convert_lazy(data, move, data.dtype)
+    return part.assign_coords(time=(part["time"].dims, moved, part["time"].attrs))
 
 
 def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:

@@ -17,6 +17,7 @@ from gyrostab.ingest.columns.pieces import SPILL_BYTES, Spool
 from gyrostab.ingest.combine import (
     attach_channels,
     concatenate,
+    continue_clocks,
     memory_bytes,
     move_to_disk,
     stamp_span,
@@ -146,6 +147,9 @@ def read_log(
             f"{regular[0].name} is a regular log already and {raw.name} is not; convert the raw "
             "logs with gyrostab ingest, and then read all of them together"
         )
+    if not regular:
+        names = sorted(parts, key=_name_key)
+        parts.update(zip(names, continue_clocks([parts[path] for path in names]), strict=True))
     channels = [read_file(path, replace(options, channels_only=True, start=None)) for path in extra]
     spans = _find_lost_spans(lost, parts, options) if lost else {}
     if regular:

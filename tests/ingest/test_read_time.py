@@ -312,6 +312,41 @@ def test_clock_of_a_32_bit_counter_is_continued(tmp_path, unit, tick, lowest):
     assert f"after {2**32 * tick:.10g} s, when its 32-bit counter is full, (1 time)" in note
 
 
+def write_files(folder, clock, names, unit="s"):
+    """Write a log in one file for each name, with the number of the row as rate."""
+    for name, rows in zip(names, np.array_split(np.arange(len(clock)), len(names)), strict=True):
+        cells = {f"time [{unit}]": clock[rows], "gyro_x [deg/h]": rows.astype(float)}
+        pd.DataFrame(cells).to_csv(folder / name, index=False)
+
+
+@pytest.mark.parametrize("limit", [2**26, 1000])
+@pytest.mark.parametrize("start", [2300, 4294.2, 3000])
+def test_clock_that_begins_again_between_files_is_continued(tmp_path, monkeypatch, start, limit):
+    monkeypatch.setattr("gyrostab.ingest.reading.SPILL_BYTES", limit)
+    clock = (np.arange(4000) * 5_000_000 + round(start * 1e6)) % 2**32  # of 20 000 s
+    write_files(tmp_path, clock, [f"run_{number}.csv" for number in range(1, 12)], "us")
+    log = regularise(read_log(tmp_path / "run_*.csv"))
+    np.testing.assert_array_equal(log.rate.values[0], np.arange(4000.0))
+    assert any("continued from the file before" in note for note in log.attrs["notes"])
+
+
+def test_files_of_other_days_keep_the_order_of_their_stamps(tmp_path):
+    clock = 1_767_225_600.0 + np.arange(300) * 864  # three days, counted from 1970
+    write_files(tmp_path, clock, ["mon.csv", "tue.csv", "fri.csv"])
+    log = regularise(read_log(tmp_path / "*.csv"))
+    np.testing.assert_array_equal(log.rate.values[0], np.arange(300.0))
+    assert not any("begins again" in note for note in log.attrs["notes"])
+
+
+def test_clock_that_restarts_between_files_is_not_continued(tmp_path):
+    write_files(
+        tmp_path, np.r_[np.arange(4000.0, 4100.0), np.arange(5.0, 105.0)], ["a.csv", "b.csv"]
+    )
+    log = regularise(read_log(tmp_path / "*.csv"))
+    assert not any("begins again" in note for note in log.attrs["notes"])
+    assert log.attrs["source_files"] == ["b.csv", "a.csv"]
+
+
 @pytest.mark.parametrize("first", [0.2, 40.0])
 def test_clock_that_restarts_elsewhere_is_not_continued(tmp_path, first):
     clock = np.concatenate([50_000 + np.arange(100) / 20, first + np.arange(100) / 20])

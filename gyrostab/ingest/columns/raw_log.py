@@ -246,6 +246,8 @@ class RawLogBuilder:
         dataset = xr.Dataset(
             data, coords=coords, attrs={"kind": self.plan.kind} if self.plan.kind else {}
         )
+        if self.clock is not None and self.time is not None:
+            dataset.attrs["clock_zero"] = self.time.epoch
         if self.options.rate is not None:
             dataset.attrs["declared_rate_hz"] = float(self.options.rate)
         if self.options.start is not None and stamps is None:

@@ -248,9 +248,7 @@ class TurningClock:
             return stamps
         good = stamps[places] + sum(self.turns)
         steps = np.diff(good)
-        rises = steps[:_TYPICAL_STEPS]
-        rises = rises[rises > 0]
-        typical = float(np.median(rises)) if rises.size else 0.0  # 0 if all stamps are equal
+        typical = typical_step(good)
         backward = np.flatnonzero(steps < -min(CLOCK_PERIODS) // 2) + 1
         turns = [] if self.last is None else [(0, find_turn(int(good[0]) - self.last, typical))]
         for row in backward.tolist():
@@ -278,6 +276,12 @@ class TurningClock:
             f"the clock begins again after {period} ({times}) "
             "without a pause; the stamps are continued"
         ]
+
+
+def typical_step(stamps: NDArray[np.int64]) -> float:
+    """Return a typical step [ns] of the first stamps of a block; 0 if all of them are equal."""
+    steps = np.diff(stamps[stamps != NAT][: _TYPICAL_STEPS + 1])
+    return float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
 
 
 def find_turn(step: int, typical: float) -> int:

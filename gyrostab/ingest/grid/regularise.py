@@ -61,6 +61,7 @@ _OWN_ATTRIBUTES = (
     "declared_rate_hz",
     "start",
     "local_time",
+    "clock_zero",
     "row_start",
     "kind",
     "notes",
