@@ -288,19 +288,22 @@ def find_breaks(stamps, n, latest, reach, longest):  # type: ignore[no-untyped-d
 def find_phase(count, stamps, period, sigma):  # type: ignore[no-untyped-def]
     """Find how far the first stamps are ahead of the row count [samples].
 
-    Lost samples and late rows put stamps ahead, so of up to 33 rows those count that are least
-    ahead; three of them at least, as one stamp may be damaged.
+    Lost samples and late rows put stamps ahead, so of up to 33 stamps those count that are least
+    ahead; they have three rows at least, as the stamp of one may be damaged.
     """
     n = min(len(count), 33)
     ahead = np.empty(n)
     for i in range(n):
         ahead[i] = (stamps[i] - stamps[0]) / period - (count[i] - count[0])
-    ahead.sort()
-    for i in range(n - 2):
-        end = i + 1
+    order = np.argsort(ahead, kind="mergesort")
+    ahead = ahead[order]
+    for i in range(n):
+        end, rows = i, 0
         while end < n and ahead[end] < ahead[i] + 1.0 + 4.0 * sigma:
+            stamp = order[end]
+            rows += count[stamp + 1] - count[stamp] if stamp + 1 < n else 1
             end += 1
-        if end - i >= 3:
+        if rows >= 3:
             return np.median(ahead[i:end])
     return np.median(ahead)
 

@@ -104,10 +104,10 @@ def test_whole_seconds_shared_by_many_rows_are_not_duplicates():
     assert abs((log.time.values[0] - np.datetime64(START, "ns")) / np.timedelta64(1, "ms")) < 11
 
 
-@pytest.mark.parametrize("first", [0, 3, 5, 9])
-def test_log_that_begins_between_two_changes_of_a_shared_stamp_has_no_gap(first):
+@pytest.mark.parametrize(("first", "pause"), [(0, 200), (3, 200), (5, 200), (9, 200), (0, 10)])
+def test_log_that_begins_between_two_changes_of_a_shared_stamp_has_no_gap(first, pause):
     count = np.arange(first, first + 5000)
-    samples = np.where(count < 200, count, count + 1000)  # a pause
+    samples = np.where(count < pause, count, count + 1000)
     log = regularise(raw_log(stamps_of(samples // 10, 10.0)))
     assert log.attrs["sampling_rate_hz"] == 100.0
     assert np.array_equal(log.rate.values[0], expected(samples - first), equal_nan=True)
