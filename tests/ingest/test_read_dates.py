@@ -220,3 +220,30 @@ def test_restart_of_a_clock_by_an_hour_is_not_daylight_saving_time(tmp_path: Pat
     path = tmp_path / "log.csv"
     pd.DataFrame({"time [s]": clock, "gyro_x [deg/h]": clock % 7}).to_csv(path, index=False)
     assert "daylight" not in scan(path).loc[0, "odd"]
+
+
+def write_fractions(path: Path, milliseconds: np.ndarray, form: str) -> Path:
+    """Write stamps, with milliseconds as a number `n`, or as a fraction `f` without last zeros."""
+    rows = [
+        form.format(s=f"{ms // 1000:02d}", n=ms % 1000, f=f"{ms % 1000:03d}".rstrip("0") or "0")
+        for ms in milliseconds.tolist()
+    ]
+    lines = ("time;gyro_x [deg/h]", *(f"2026-05-01 12:00:{row};{n}" for n, row in enumerate(rows)))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("form", ["{s}.{n}", "{s},{n}"])
+@pytest.mark.parametrize("step", [1, 5, 50])
+def test_fractions_without_leading_zeros_are_refused(tmp_path: Path, form: str, step: int) -> None:
+    path = write_fractions(tmp_path / "log.csv", step * np.arange(10_000 // step), form)
+    with pytest.raises(UnitError, match=r"log.csv: line \d+: the time '12:00:00.*leading zeros"):
+        read_log(path)
+
+
+@pytest.mark.parametrize("form", ["{s}.{f}", "{s}.{n:03d}"])
+def test_fractions_of_rows_out_of_order_are_read(tmp_path: Path, form: str) -> None:
+    milliseconds = 5 * np.random.default_rng(1).permutation(2000)
+    raw = read_log(write_fractions(tmp_path / "log.csv", milliseconds, form))
+    since = stamps_of(raw) - np.datetime64("2026-05-01T12:00:00")
+    np.testing.assert_array_equal(since / np.timedelta64(1, "ms"), milliseconds)

@@ -7,6 +7,7 @@ are parsed cell by cell (`gyrostab.ingest.text.cells`).
 from __future__ import annotations
 
 import gzip
+import re
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -19,7 +20,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.errors import FormatError
+from gyrostab.errors import FormatError, UnitError
 from gyrostab.ingest.columns.dates import (
     find_order,
     has_offset,
@@ -31,7 +32,7 @@ from gyrostab.ingest.columns.headers import FileColumn
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.plan_roles import plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
-from gyrostab.ingest.columns.stamps import cells_to_ns, is_number
+from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, is_number
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.ingest.text.cells import BlockParser, ParsedBlock
 from gyrostab.ingest.text.layout import Layout, find_layout, is_text, unit_of_duration
@@ -43,6 +44,10 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
 HEAD_BYTES, MAX_HEAD_BYTES, HEAD_LINES = 2**18, 2**24, 4
 BLOCK_BYTES = 2**22
 COUNTED_BYTES = 2**24
+#: Time of day and fraction of a second, a fraction with leading zeros, and the number of steps back
+#: of which the fractions are compared.
+_FRACTION, _PADDED = re.compile(r"(\d\d?:\d\d:\d\d)[.,](\d+)"), re.compile(rb":\d\d[.,]0\d")
+_COMPARED_ROWS = 100
 
 
 def matches(path: Path) -> bool:
@@ -86,14 +91,42 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
         return parsed, builder.prepare(parsed.values, parsed.stamps, words=parsed.words)
 
     blocks = _read_blocks(path, layout.offset, growing=options.growing)
+    dates = plan.time if plan.time is not None and plan.time.time_unit is None else None
     for parsed, converted in map_in_order(parse, blocks):
+        if dates is not None:
+            _check_fractions(parsed, f"{path.name}: ", line, dates)
         builder.add(converted, partial(parsed.name_lines, line), parsed.quote_line)
         line += parsed.lines
     raw = builder.finish(layout.notes)
-    if plan.time is not None and plan.time.time_unit is None:
-        cells = [row[plan.time.source] for row in layout.samples]
+    if dates is not None:
+        cells = [row[dates.source] for row in layout.samples]
         raw.attrs["local_time"] = not any(map(has_offset, cells))
     return raw
+
+
+def _check_fractions(parsed: ParsedBlock, where: str, line: int, time: Column) -> None:
+    """Refuse fractions of a second without leading zeros, such as ``.5`` for 5 ms.
+
+    Time then runs backwards only from a smaller number to one of more digits, ``.9`` to ``.10``.
+    """
+    stamps = np.empty(0, np.int64) if parsed.stamps is None else parsed.stamps
+    is_back = (stamps[1:] != NAT) & (stamps[1:] < stamps[:-1])
+    rows = np.flatnonzero(is_back)[:_COMPARED_ROWS].tolist()
+    if len(rows) < 2 or _PADDED.search(parsed.block):
+        return
+    short_fractions = []
+    for row in rows:
+        before, after = (_FRACTION.search(parsed.quote_line(at)) for at in (row, row + 1))
+        if before and after and before[1] == after[1] and len(before[2]) < len(after[2]):
+            short_fractions += [(row, before[0], after[0])] * (int(before[2]) < int(after[2]))
+    if len(short_fractions) > max(1, len(rows) / 2):
+        row, earlier, later = short_fractions[0]
+        raise UnitError(
+            f"{where}{parsed.name_lines(line, [row])[0]}: the time {earlier!r} comes before "
+            f"{later!r}, so the fractions of a second lack leading zeros; write .005 and not .5 "
+            f'for 5 ms, or give rate and start instead: --map "{time.header}=-" --rate HZ '
+            "--start 2026-05-01T08:00:00"
+        )
 
 
 def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
