@@ -29,6 +29,7 @@ _UNCERTAIN_SIGMA, _MANY_SHARE = 0.3, 0.05
 _IF_HIGHER = "; if many samples are missing, the sampling rate may be higher: give it with --rate"
 _MAX_ZONE_HOURS = 14  # largest offset of local time from UTC
 _MAX_NAMED = 5  # events of one kind that are listed one by one
+_MAX_WANDER = 0.02  # relative deviation of a sampling rate that wanders
 #: Rows of which the steps of angles are taken, and the least number.
 _STEP_ROWS, _MIN_STEP_ROWS = 2**14, 100
 #: Angles are like increments if their steps, over sqrt(2), are more than this share of their
@@ -156,6 +157,16 @@ def describe_rate(
             f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million "
             f"from {rate:.10g} Hz"
         )
+    if len(deviating) > 2 and all(
+        abs(stretch.rate / rate - 1) < _MAX_WANDER for stretch in deviating
+    ):
+        rates = [stretch.rate for stretch in deviating]
+        notes.append(
+            f"{where}: the sampling rate is not {rate:.6g} Hz throughout, but wanders from "
+            f"{min(rates):.6g} to {max(rates):.6g} Hz, as without a stable clock; by their stamps "
+            "samples are missing or dropped"
+        )
+        deviating = []
     for stretch in deviating[:_MAX_NAMED]:
         (file, first), (_, last) = (file_of(raw, row) for row, _ in (stretch.first, stretch.last))
         begin, end = (format_stamp(stamp) for _, stamp in (stretch.first, stretch.last))

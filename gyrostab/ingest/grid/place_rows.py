@@ -116,7 +116,12 @@ class RowPlacer:
             if _is_sharp(estimate.jitter):
                 deviating = deviating_stretches(stamps, 1e9 / rate)
         notes += describe_rate(raw, estimate, rate, deviating, placement)
-        changes = tuple(end[1] for stretch in deviating for end in stretch[:2])
+        changes = tuple(
+            end[1]
+            for stretch in deviating
+            if abs(stretch.rate / rate - 1) > _MAX_RATE_DIFFERENCE
+            for end in stretch[:2]
+        )
         return replace(placement, rate_changes=changes), rate, notes
 
     def _place_without_time(self) -> tuple[Placement, float, list[str]]:

@@ -47,6 +47,7 @@ from gyrostab.ingest.grid.starting_period import (
     starting_period,
     step_scatter,
     time_per_row,
+    track_period,
 )
 from gyrostab.kernels.grid.stamps import NO_STAMP
 
@@ -313,6 +314,9 @@ def _estimate_sharp(stamps: Stamps, parts: Parts, rate: float) -> RateEstimate |
 
 
 _STRETCH = 1024  # stretch whose rate is compared with that of the log [stamps]
+#: Smallest relative deviation of its rate that is noted. Jitter of 0.2 samples makes 0.0003.
+_MIN_DEVIATION = 0.003
+_MAX_TRACKED_DEVIATION = 0.02  # largest one at which the samples are counted by the rate of the log
 
 
 class DeviatingStretch(NamedTuple):
@@ -324,9 +328,10 @@ class DeviatingStretch(NamedTuple):
 
 
 def deviating_stretches(stamps: Stamps, period: float) -> list[DeviatingStretch]:
-    """Find stretches whose rate deviates by more than 2 % from one over `period` [ns].
+    """Find stretches whose rate deviates by more than 0.3 % from one over `period` [ns].
 
-    Only steps of another length count as a deviation, not missing or doubled rows.
+    Only steps of another length count as a deviation, not missing or doubled rows. Within a
+    stretch, the rate differs by less than that from the one at its beginning.
     """
     stretches: list[DeviatingStretch] = []
     inside = False
@@ -334,24 +339,32 @@ def deviating_stretches(stamps: Stamps, period: float) -> list[DeviatingStretch]
         is_readable = values != NO_STAMP
         rows, values = rows[is_readable], values[is_readable]
         begins, paces = _stretch_paces(values)
-        suspects = np.abs(paces / period - 1) >= 0.02
-        if not suspects.any():
-            inside = False if len(suspects) else inside
+        deviations = np.abs(paces / period - 1)
+        if not (deviations >= _MIN_DEVIATION).any():
+            inside = False if len(deviations) else inside
             continue
-        for begin, is_suspect in zip(begins.tolist(), suspects.tolist(), strict=True):
+        for begin, deviation in zip(begins.tolist(), deviations.tolist(), strict=True):
             part = values[begin : begin + _STRETCH]
-            own_period = period_of_lines([part]) if is_suspect else None
-            is_deviating = own_period is not None and abs(own_period / period - 1) > 0.02
+            own_period: float | None = None
+            if deviation >= _MAX_TRACKED_DEVIATION:  # steps of 1.25 samples would be losses
+                own_period = period_of_lines([part])
+            elif deviation >= _MIN_DEVIATION:
+                own_period = track_period([part], period)
+            is_deviating = own_period is not None and _is_other_period(own_period, period)
             if is_deviating and own_period is not None:
                 last = begin + len(part) - 1
                 end = int(rows[last]), int(part[-1])
-                if inside:
+                if inside and not _is_other_period(own_period, SECOND / stretches[-1].rate):
                     stretches[-1] = stretches[-1]._replace(last=end)
                 else:
                     first = int(rows[begin]), int(part[0])
                     stretches.append(DeviatingStretch(first, end, SECOND / own_period))
             inside = is_deviating
     return stretches
+
+
+def _is_other_period(period: float, other: float) -> bool:
+    return abs(period / other - 1) > _MIN_DEVIATION
 
 
 def _stretch_paces(values: Integers) -> tuple[Integers, NDArray[np.float64]]:

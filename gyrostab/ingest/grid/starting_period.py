@@ -213,20 +213,21 @@ def period_of_lines(parts: Parts) -> float | None:
     if length < 12 or good.sum() < max(1, 0.03 * len(slope)):
         return None
     # one that occurs: if the rate changes, the mean of the two middle ones does not
-    period = float(np.quantile(slope[good], 0.5, method="lower"))
+    period: float | None = float(np.quantile(slope[good], 0.5, method="lower"))
     for gain in (0.5, 0.5, 0.2, 0.1, TRACK_GAIN):
-        time = samples = 0
-        for part in parts:
-            count, piece = track(part, period, gain, 20 * period)
-            same = np.diff(piece) == 0
-            time, samples = (
-                time + int(np.diff(part)[same].sum()),
-                samples + int(np.diff(count)[same].sum()),
-            )
-        if samples <= 0:
-            return None
-        period = time / samples
+        period = None if period is None else track_period(parts, period, gain)
     return period
+
+
+def track_period(parts: Parts, period: float, gain: float = TRACK_GAIN) -> float | None:
+    """Return the mean period [ns] of stamps near multiples of one; None if they do not rise."""
+    time = samples = 0
+    for part in parts:
+        count, piece = track(part, period, gain, 20 * period)
+        same = np.diff(piece) == 0
+        time += int(np.diff(part)[same].sum())
+        samples += int(np.diff(count)[same].sum())
+    return time / samples if samples > 0 else None
 
 
 def starting_period(stretches: Parts) -> tuple[float, bool, bool]:

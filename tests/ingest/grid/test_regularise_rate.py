@@ -142,6 +142,26 @@ def test_stretch_at_another_rate_is_noted():
     assert abs(log.sizes["time"] - 9000 - 3999 * 1.25) < 3
 
 
+def test_change_of_the_rate_by_one_percent_is_noted():
+    steps = np.repeat([1 / 100, 1 / 101], 10_240)
+    log = regularise(raw_log(stamps_of(np.cumsum(steps), 1.0)))
+    notes = [note for note in log.attrs["notes"] if "split the log" in note]
+    assert ["at 100 Hz" in notes[0], "(row 10240)" in notes[1], "at 101 Hz" in notes[1]] == [
+        True
+    ] * 3
+    assert "rate_changes" not in log.attrs  # too small to change N
+
+
+@pytest.mark.parametrize(("deviation", "is_noted"), [(0.0, False), (0.001, False), (0.01, True)])
+def test_rate_that_wanders_has_one_note(deviation, is_noted):
+    wave = 1 + deviation * np.sin(np.arange(40_000) / 40_000 * 2 * np.pi)
+    jitter = 0.0005 * np.random.default_rng(1).standard_normal(40_000)
+    log = regularise(raw_log(stamps_of(np.cumsum(0.01 * wave) + jitter, 1.0)))
+    notes = [note for note in log.attrs["notes"] if "at these rows" in note or "wanders" in note]
+    assert len(notes) == is_noted
+    assert all("wanders from 99." in note for note in notes)
+
+
 def test_three_rows_are_enough():
     log = regularise(raw_log(stamps_of([0, 1, 5], 10.0)))
     assert log.attrs["sampling_rate_hz"] == 10.0
