@@ -35,6 +35,9 @@ _STEP_ROWS, _MIN_STEP_ROWS = 2**14, 100
 #: Angles are like increments if their steps, over sqrt(2), are more than this share of their
 #: standard deviation: white increments have 1, and a random walk of 100 rows or more 0.2 or less.
 _INCREMENT_STEP_SHARE = 0.5
+#: Increments are like angles if a larger share of their steps over one of these numbers of rows
+#: have one direction: over one row, an angle that wraps around; over many, a noisy angle.
+_ONE_WAY_SHARE, _LAG_ROWS = 0.98, (1, 64)
 
 
 def describe_channels(log: xr.Dataset) -> list[str]:
@@ -75,19 +78,29 @@ def _find_zone(stamps: NDArray[np.datetime64], start: np.datetime64, end: np.dat
 
 
 def describe_angles(raw: xr.Dataset) -> list[str]:
-    """Return a note if cumulative angles have the steps of increments."""
+    """Return a note if cumulative angles look like increments, or increments like angles."""
     values = np.asarray(raw["angle"].isel(row=slice(0, _STEP_ROWS)).values, dtype=np.float64)
     finite = values[:, np.isfinite(values).all(axis=0)]
+    if finite.shape[1] <= _MIN_STEP_ROWS:
+        return []
+    if raw.attrs.get("kind") == "increment":
+        share = max(_one_way_share(finite, lag) for lag in _LAG_ROWS)
+        return [
+            f"{record_name(raw)}: with --kind rate each row is an increment, but the values rise "
+            "or fall throughout like cumulative angles; if they are, give --kind angle"
+        ] * (share > _ONE_WAY_SHARE)
     steps = np.diff(finite, axis=1)
-    if steps.shape[1] < _MIN_STEP_ROWS:
-        return []
     shares = steps.std(axis=1) / np.sqrt(2.0) / np.maximum(finite.std(axis=1), 1e-300)
-    if not (shares > _INCREMENT_STEP_SHARE).all():
-        return []
     return [
         f"{record_name(raw)}: with --kind angle the angles are cumulative, but they change from "
         "row to row like increments; if each row is an increment, give --kind rate"
-    ]
+    ] * bool((shares > _INCREMENT_STEP_SHARE).all())
+
+
+def _one_way_share(values: NDArray[np.float64], lag: int) -> float:
+    """Return the share of steps over `lag` rows in one direction, on the axis with the largest."""
+    steps = values[:, lag:] - values[:, :-lag]
+    return float(max((steps > 0).mean(axis=1).max(), (steps < 0).mean(axis=1).max()))
 
 
 def _format_span(first: np.datetime64, last: np.datetime64) -> str:

@@ -257,10 +257,10 @@ def regularise(
         find_gaps(placement, scanned), raw.attrs.get("unreadable_spans", ()), placement.start, hertz
     )
     notes += describe_placement(raw, scanned, placement, table, hertz)
-    if name == "angle" and raw.attrs.get("kind") == "angle":
+    increments = raw.attrs.get("kind") == "increment"
+    if name == "angle":
         notes += [*turns, *describe_angles(raw)]
 
-    increments = raw.attrs.get("kind") == "increment"
     to_rate = hertz * HOUR  # degree a sample to degree an hour
     scale = to_rate if increments else 1.0
     unit = raw[name].encoding.get("scale_factor")

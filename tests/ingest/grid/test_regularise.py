@@ -180,6 +180,26 @@ def test_increments_that_are_read_as_cumulative_angles_get_a_note(seed):
         assert any(note in text for text in log.attrs["notes"]) == is_noted
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("degree_per_second", "noise"), [(15 / 3600, 2e-5), (0.1, 5e-4), (300.0, 1e-3), (-3.0, 0.01)]
+)
+def test_cumulative_angles_that_are_read_as_increments_get_a_note(degree_per_second, noise, seed):
+    random = np.random.default_rng(seed)
+    increments = degree_per_second / 100 + noise * random.standard_normal((2, 3000))
+    increments[1] = noise * random.standard_normal(3000)  # an axis at rest
+    moving = increments + np.sin(np.arange(3000) / 500)
+    stamps = stamps_of(np.arange(3000), 100.0)
+    note = "they are, give --kind angle"
+    for values, is_noted in (
+        (increments, False),
+        (moving, False),
+        (np.cumsum(increments, axis=1) % 360, True),
+    ):
+        log = regularise(raw_log(stamps, values, kind="increment"))
+        assert any(note in text for text in log.attrs["notes"]) == is_noted
+
+
 def test_unreadable_cells_infinite_values_and_lost_stamps():
     values = np.arange(400.0).reshape(2, 200)
     values[0, 50:53] = np.nan  # one axis
