@@ -140,29 +140,31 @@ def _estimate_ordered(stamps: Stamps, stretches: Parts, parts: Parts, sure: floa
     lost = None if finer is None else _estimate_sharp(stamps, parts, SECOND / finer)
     if lost is not None:
         return replace(lost, even=float(f"{SECOND / time_per_row(stretches):.4g}"))
-    if (
-        counted
-        or step_scatter(steps, period) > _SHARP_SCATTER
-        or np.mean(steps == 0) >= SHARED_SHARE
-    ):
+    is_uneven = step_scatter(steps, period) > _SHARP_SCATTER
+    jitter: JitterModel | None = None
+    if counted or is_uneven or np.mean(steps == 0) >= SHARED_SHARE:
         peaks = [] if coarse else comb_peaks(parts)
         guesses = [(period, MIN_SIGMA)]
         if peaks and losses_accumulate(parts):
             guesses += [peak for peak in peaks if peak[0] > MIN_TICKS * clock_tick(parts)]
         jitter = _fit_jitter(stretches, guesses, coarse, sure)
         if jitter is not None:
+            finer_rate = _finer_rate(stretches, peaks, jitter, sure)
             estimate = _estimate_with_jitter(stamps, jitter, coarse, sure)
-            even = packet_rate(stretches, estimate.rate)
-            return replace(estimate, even=even, finer=_finer_rate(stretches, peaks, jitter, sure))
-        if np.mean(steps == 0) >= SHARED_SHARE:  # rows are not doubled: that would fit
+            estimate = replace(estimate, finer=finer_rate)
+        elif np.mean(steps == 0) >= SHARED_SHARE:  # rows are not doubled: that would fit
             period, counted, coarse = time_per_row(stretches, ticks=True), True, True
-    longest = longest_step(parts, period) if counted else sure * period
-    estimate = _estimate_pooled(stamps, period, longest, counted=counted, coarse=coarse)
-    return replace(
-        estimate,
-        even=None if counted else packet_rate(stretches, estimate.rate),
-        finer=None if finer is None else float(f"{SECOND / finer:.4g}"),
-    )
+    if jitter is None:
+        longest = longest_step(parts, period) if counted else sure * period
+        estimate = _estimate_pooled(stamps, period, longest, counted=counted, coarse=coarse)
+        finer_rate = None if finer is None else float(f"{SECOND / finer:.4g}")
+        estimate = replace(estimate, finer=finer_rate)
+    even = None if estimate.counted else packet_rate(stretches, estimate.rate)
+    if even is None or not is_uneven:
+        return replace(estimate, even=even)
+    # samples have even steps, and rows that arrive in packets do not
+    period = time_per_row(stretches)
+    return _estimate_pooled(stamps, period, longest_step(parts, period), counted=True)
 
 
 def _fit_jitter(
