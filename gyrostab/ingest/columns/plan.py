@@ -151,6 +151,18 @@ class Plan:
         self.summaries.append(ColumnSummary(column.header, name, role, unit, column.key))
 
 
+def describe_left_out(reason: str, names: Sequence[str], advice: str = "") -> list[str]:
+    """Return a note on columns that are left out, if there are any.
+
+    Examples
+    --------
+    >>> describe_left_out("they carry no unit", ["a", "b"], "give one"), describe_left_out("", [])
+    (['left out, as they carry no unit: a, b (give one)'], [])
+    """
+    listed = list_some(names, MAX_HEADERS)
+    return [f"left out, as {reason}: {listed}{f' ({advice})' if advice else ''}"] * bool(names)
+
+
 def name_columns(
     plan: Plan,
     columns: Sequence[FileColumn],

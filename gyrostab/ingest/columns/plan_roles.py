@@ -33,6 +33,7 @@ from gyrostab.ingest.columns.plan import (
     Column,
     Plan,
     PresetMatch,
+    describe_left_out,
     find_preset,
     name_columns,
     resolve_duplicates,
@@ -101,7 +102,8 @@ def _plan_gyro(plan: Plan, gyro: list[Header], columns: Sequence[FileColumn]) ->
     if plan.options.channels_only:
         for column in gyro:
             plan.leave_out(column)
-        _note_left_out(plan, "the file is read for its channels", [c.header for c in gyro])
+        left_out = [column.header for column in gyro]
+        plan.notes += describe_left_out("the file is read for its channels", left_out)
         return
     if not gyro:
         if not plan.problems:
@@ -241,19 +243,12 @@ def _plan_channels(plan: Plan, rest: list[Header]) -> None:
         if likely is None and is_unit_of(name, ("rate",)):
             option = f'--map "{name}=rotation_rate [{name}]"'
         advice = f"keep one with a unit: {option}"
-        _note_left_out(plan, "they carry no unit", left_out["unit"], advice)
+        plan.notes += describe_left_out("they carry no unit", left_out["unit"], advice)
     needed = len(plan.columns) - others + len(left_out["limit"])
     advice = "map those that are needed (--map NAME=NAME); "
     advice += describe_limit("channels", needed, limits)
     reason = "there are more channels than a log keeps"
-    _note_left_out(plan, reason, left_out["limit"], advice)
-
-
-def _note_left_out(plan: Plan, reason: str, headers: list[str], advice: str = "") -> None:
-    """Add a note on columns that were left out, if there are any."""
-    if headers:
-        listed = list_some(headers, MAX_HEADERS)
-        plan.notes.append(f"left out, as {reason}: {listed}{f' ({advice})' if advice else ''}")
+    plan.notes += describe_left_out(reason, left_out["limit"], advice)
 
 
 def _note_temperatures(plan: Plan, rest: list[Header]) -> None:

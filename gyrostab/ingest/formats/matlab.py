@@ -36,8 +36,10 @@ from gyrostab.ingest.columns.headers import (
     is_time_unit,
     time_suffix,
 )
+from gyrostab.ingest.columns.plan import describe_left_out
 from gyrostab.ingest.formats.packing import ATTRIBUTES, attribute_text
 from gyrostab.ingest.formats.tables import (
+    MAX_COLUMNS,
     StoredArray,
     Table,
     TableColumn,
@@ -66,8 +68,6 @@ _STRUCT, _OBJECT, _OPAQUE, _NUMERIC, _CLASSES = 2, 3, 17, range(6, 16), range(1,
 _DAMAGE = (KeyError, ValueError, OverflowError, RecursionError, struct.error, zlib.error)
 
 Arrays = Iterator[tuple[str, NDArray[Any]]]
-#: Most columns of a matrix that is read as a table of sensors.
-MAX_COLUMNS = 64
 
 
 def matches(path: Path) -> bool:
@@ -114,14 +114,7 @@ def _make_table(path: Path, options: ReadOptions, stack: ExitStack) -> TablesOfF
     rows = int(max(size for size, _ in sized_columns))
     columns = [column for size, column in sized_columns if size == rows]
     shorter = [column.name[0] for size, column in sized_columns if size != rows]
-    notes = (
-        [
-            f"left out, as they are shorter than the {rows} rows of the longest: "
-            f"{', '.join(shorter[:20])}"
-        ]
-        if shorter
-        else []
-    )
+    notes = describe_left_out(f"they are shorter than the {rows} rows of the longest", shorter)
     if objects:
         notes.append(
             f"left out, as MATLAB alone can read it: {', '.join(dict.fromkeys(objects))}; to "

@@ -23,10 +23,12 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, SchemaError, TimeError
 from gyrostab.ingest.columns.headers import AXIS_PATTERN, split_header
+from gyrostab.ingest.columns.plan import describe_left_out
 from gyrostab.ingest.columns.stamps import names_epoch
 from gyrostab.ingest.concat.grid import log_span
 from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.formats.tables import (
+    MAX_COLUMNS,
     StoredArray,
     Table,
     TableColumn,
@@ -45,7 +47,6 @@ from gyrostab.store.read import open_stored
 from gyrostab.store.remote import find_url
 from gyrostab.store.times import decode_stamps
 
-MAX_COLUMNS = 64
 #: Names of variables whose columns are gyro axes.
 _SIGNALS = ("gyro", "rate")
 _CALENDARS = ("standard", "gregorian", "proleptic_gregorian")
@@ -120,11 +121,7 @@ def _find_tables(path: Path, stored: xr.Dataset, options: ReadOptions) -> Tables
         else:
             columns[dim] += variable_columns
         left_out += [] if variable_columns else [name]
-    notes = (
-        [f"left out, as they do not run along {main_dim!r} alone: {', '.join(left_out[:20])}"]
-        if left_out
-        else []
-    )
+    notes = describe_left_out(f"they do not run along {main_dim!r} alone", left_out)
     return [Table(sizes[dim], part, clocks.get(dim)) for dim, part in columns.items()], notes
 
 

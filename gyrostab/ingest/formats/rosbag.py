@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from gyrostab.ingest.columns.plan import describe_left_out
 from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import Messages, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
@@ -63,12 +64,10 @@ def _read_topics(path: Path, options: ReadOptions) -> TablesOfFile:
         for (topic, kind), messages in by_topic.items()
     ]
     reasons = (
-        ("their messages are large", left_out),
+        ("their messages are large", list(left_out)),
         ("the types of their messages are unknown", sorted(unknown)),
     )
-    return tables, [
-        f"left out, as {reason}: {', '.join(topics)}" for reason, topics in reasons if topics
-    ]
+    return tables, [note for reason in reasons for note in describe_left_out(*reason)]
 
 
 def _message_time(message: Any) -> int:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import FormatError, OptionError, UnitError
 from gyrostab.ingest.columns.headers import FileColumn
-from gyrostab.ingest.columns.plan import MAX_HEADERS, Column, Plan
+from gyrostab.ingest.columns.plan import Column, Plan, describe_left_out
 from gyrostab.ingest.columns.plan_roles import plan_columns
 from gyrostab.ingest.columns.stamps import NAT, parse_time_unit
 from gyrostab.ingest.columns.typed import float32_note, read_columns, summarise_columns
@@ -32,7 +32,9 @@ from gyrostab.ingest.formats.packing import Decoder, attribute_text, fold_packin
 from gyrostab.ingest.limits import check_stored
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.store.private import library_lock
-from gyrostab.wording import list_some
+
+#: Most columns of an array of two dimensions that is read as a table of sensors.
+MAX_COLUMNS = 64
 
 
 @dataclass(frozen=True)
@@ -224,13 +226,11 @@ def _leave_out_unplaced(planned: _PlannedTables) -> _PlannedTables:
         ("some stamps of the file are dates and others need --epoch", undated),
     ):
         left_out = [c for place in sorted(places) for c in plans[place].columns if c.role != "time"]
-        if left_out:
-            names = list_some([column.name for column in left_out], MAX_HEADERS)
-            plan = replace(
-                plan,
-                columns=[column for column in plan.columns if column not in left_out],
-                notes=[*plan.notes, f"left out, as {reason}: {names}"],
-            )
+        plan = replace(
+            plan,
+            columns=[column for column in plan.columns if column not in left_out],
+            notes=[*plan.notes, *describe_left_out(reason, [column.name for column in left_out])],
+        )
     main = [place for place in planned.main if place not in undated]
     return replace(planned, plan=plan, main=main)
 
