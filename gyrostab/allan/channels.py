@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import TimeError
 from gyrostab.kernels.regression.trend import window_trend
 from gyrostab.schema import log_channels
-from gyrostab.store.lazy import read_slice
+from gyrostab.store.lazy import fill_masked, read_slice
 from gyrostab.time.grid import first_stamp, grid_times
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import HOUR, INNER
@@ -104,7 +104,7 @@ def _fit_trends(
     a: NDArray[np.int64],
     b: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    data = np.ascontiguousarray(values, dtype=np.float64)
+    data = np.ascontiguousarray(fill_masked(values), dtype=np.float64)
     seconds = np.arange(data.size) / rate if stamps is None else (stamps - stamps[:1]) / 1e9
     return np.asarray(window_trend(data, seconds, a, b))
 

@@ -104,7 +104,7 @@ def make_log(
 
 
 def _real_numbers(values: Any, label: str) -> Any:
-    """Return an array, in dask if it is, with NaN in the place of infinite values."""
+    """Return an array, in dask if it is, with NaN in the place of infinite and masked values."""
     try:
         is_array = isinstance(values, da.Array | np.ma.MaskedArray)
         data: Any = values if is_array else np.asarray(values)
@@ -114,8 +114,6 @@ def _real_numbers(values: Any, label: str) -> Any:
         raise OptionError(
             f"{label} are of type {data.dtype}; give real numbers, and NaN where one is missing"
         )
-    if hasattr(data, "filled"):  # masked
-        data = data.astype(np.float64).filled(np.nan)
     return hide_infinite(data)
 
 

@@ -178,7 +178,11 @@ def read_box(array: Any, box: Sequence[slice]) -> NDArray[Any]:
     source = find_source(array)
     selection = (array if source is None else source)[ends]
     return np.asarray(
-        selection.compute(scheduler="synchronous") if hasattr(selection, "compute") else selection
+        fill_masked(
+            selection.compute(scheduler="synchronous")
+            if hasattr(selection, "compute")
+            else selection
+        )
     )
 
 
@@ -215,8 +219,28 @@ def convert_lazy(array: Any, convert: Callable[[NDArray[Any]], NDArray[Any]], dt
     return array.map_blocks(convert, dtype=dtype, meta=np.empty((0,) * array.ndim, dtype))
 
 
+def fill_masked(array: Any) -> Any:
+    """Return an array with NaN in the place of masked values, lazy if it is; others unchanged.
+
+    Examples
+    --------
+    >>> fill_masked(np.ma.array([1, 2], mask=[False, True]))
+    array([ 1., nan])
+    """
+    if not isinstance(getattr(array, "_meta", array), np.ma.MaskedArray):
+        return array
+    if array.dtype.kind != "f":
+        array = array.astype(np.float64)
+    return (
+        convert_lazy(array, fill_masked, array.dtype)
+        if hasattr(array, "dask")
+        else array.filled(np.nan)
+    )
+
+
 def hide_infinite(array: Any) -> Any:
-    """Return an array with NaN in the place of infinite values, lazy if it is."""
+    """Return an array with NaN in the place of infinite and masked values, lazy if it is."""
+    array = fill_masked(array)
     if array.dtype.kind != "f":
         return array
     if hasattr(array, "dask"):

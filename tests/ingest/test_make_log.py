@@ -74,15 +74,52 @@ def test_bad_input_is_refused_with_advice(change, error, message):
         make_log(options.pop("values"), **options)
 
 
-def test_masked_values_are_missing():
-    masked = np.ma.masked_where(VALUES > 1.0, VALUES)
+def _mask_blocks(masked):
+    """Return dask chunks with masks that the type of the dask array does not show."""
+    plain = da.from_array(np.ma.getdata(masked), chunks=20)
+    mask = da.from_array(np.ma.getmaskarray(masked), chunks=20)
+    meta = np.empty(0, plain.dtype)
+    return da.map_blocks(np.ma.masked_where, mask, plain, meta=meta)
+
+
+TO_MASKED = pytest.mark.parametrize(
+    "to_array", [lambda masked: masked, lambda masked: da.from_array(masked, 20), _mask_blocks]
+)
+
+
+@TO_MASKED
+def test_masked_values_are_missing(to_array):
+    masked = to_array(np.ma.masked_where(VALUES > 1.0, VALUES))
     channels = {"temperature": (masked, "degC")}
     log = make_log(masked, rate=10.0, unit="deg/h", channels=channels)
     expected = np.where(VALUES > 1.0, np.nan, VALUES)
     np.testing.assert_array_equal(log.rate.values[0], expected)
     np.testing.assert_array_equal(log.temperature.values, expected)
-    counts = make_log(np.ma.masked_equal([3, 0, 5], 0), rate=10.0, unit="2 deg/h")
-    np.testing.assert_array_equal(counts.rate.values[0], [6.0, np.nan, 10.0])
+
+
+@pytest.mark.parametrize("to_array", [lambda masked: masked, da.from_array])
+def test_masked_counts_are_missing(to_array):
+    counts = to_array(np.ma.masked_equal([3, 0, 5], 0))
+    channels = {"temperature": (counts, "degC")}
+    log = make_log(counts, rate=10.0, unit="2 deg/h", channels=channels)
+    np.testing.assert_array_equal(log.rate.values[0], [6.0, np.nan, 10.0])
+    np.testing.assert_array_equal(log.temperature.values, [3.0, np.nan, 5.0])
+
+
+@TO_MASKED
+def test_masked_values_are_missing_in_windows(to_array):
+    """The samples under the mask are far from the others, and change no average."""
+    data = np.where(np.arange(400) % 5 == 0, 1e6, np.arange(400) % 3)
+    array = to_array(np.ma.masked_equal(data, 1e6))
+    attrs = {"units": "degree hour-1"}
+    log = make_log(np.zeros(400), rate=10.0, unit="deg/h")
+    log = log.assign(
+        rate=(("axis", "time"), array[None], attrs), pressure=("time", array, {"units": "Pa"})
+    )
+    surface = gyrostab.davar(log, window="10s", step="10s").compute()
+    expected = np.nanmean(np.where(data == 1e6, np.nan, data).reshape(4, 100), axis=1)
+    np.testing.assert_allclose(surface.pressure, expected)
+    np.testing.assert_allclose(surface.window_mean[0], expected)
 
 
 @pytest.mark.parametrize("unit", [None, 3])
