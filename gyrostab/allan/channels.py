@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import TimeError
 from gyrostab.kernels.regression.trend import window_trend
-from gyrostab.schema import log_channels
+from gyrostab.schema import find_unusable_channels, log_channels
 from gyrostab.store.lazy import fill_masked, read_slice
 from gyrostab.time.grid import first_stamp, grid_times
 from gyrostab.time.stamps import to_nanoseconds
@@ -42,8 +42,8 @@ def window_channels(
     Returns
     -------
     dict of str to xarray.Variable
-        ``<channel>(time)`` [unit of the channel] and, for temperatures, ``<channel>_rate(time)`` [K
-        hour-1]; dask arrays if the channel is one and `part` is None.
+        ``<channel>(time)`` [unit of the channel, if it has one] and, for temperatures,
+        ``<channel>_rate(time)`` [K hour-1]; dask arrays if the channel is one and `part` is None.
 
     Raises
     ------
@@ -58,10 +58,11 @@ def window_channels(
             group for group in groups if group.start < part.stop and group.stop > part.start
         ]
         inside = slice(part.start - selected[0].start, part.stop - selected[0].start)
+    unusable = find_unusable_channels(log)
     for name in log_channels(log):
-        channel = log[name]
-        if not np.issubdtype(channel.dtype, np.number):
+        if name in unusable:
             continue
+        channel = log[name]
         stamps = None
         if channel.dims != ("time",):
             stamps = to_nanoseconds(log.variables[f"time_{name}"].values)
@@ -80,12 +81,12 @@ def window_channels(
             bounds.append(edges)
         trends = _find_trends(channel.data, stamps, rate, bounds, lazy=part is None)
         mean, slope = trends[:, inside]
-        units = channel.attrs.get("units", "1")
+        units = {key: channel.attrs[key] for key in ("units",) if key in channel.attrs}
         label = str(channel.attrs.get("long_name", name.replace("_", " ")))
         out[name] = xr.Variable(
-            ("time",), mean, {"long_name": f"{label}, mean of the window", "units": units}
+            ("time",), mean, {"long_name": f"{label}, mean of the window", **units}
         )
-        if units == INNER["temperature"]:
+        if units.get("units") == INNER["temperature"]:
             out[f"{name}_rate"] = xr.Variable(
                 ("time",),
                 slope * HOUR,

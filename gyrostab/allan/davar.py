@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -23,7 +24,7 @@ from gyrostab.errors import OptionError
 from gyrostab.ingest.convert import as_log
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.workspace import Workspace
-from gyrostab.schema import attributes, log_channels
+from gyrostab.schema import attributes, find_unusable_channels, log_channels
 from gyrostab.time.grid import first_stamp, grid_times
 
 #: Smallest number of parts for the threads to share, if there are as many units of work.
@@ -127,6 +128,7 @@ def davar(
         log, window=window, step=step, taus=taus, tau_max=tau_max, axis=axis,
         min_strict=min_strict, min_coverage=min_coverage, variance=variance,
     )  # fmt: skip
+    _warn_unusable_channels(log)
     cells, means = run_units(plan)
     return _attach_labels(cells, means, log, plan)
 
@@ -154,7 +156,9 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
     >>> davar_parts(log, samples=500_000, window="1min", step="30s")
     [slice(0, 85, None), slice(85, 170, None), slice(170, 255, None), slice(255, 332, None)]
     """
-    plan = make_plan(as_log(log), **options)
+    log = as_log(log)
+    plan = make_plan(log, **options)
+    _warn_unusable_channels(log)
     axes, size = plan.signal.shape
     units = units_of_work(size, plan.unit)
     per_unit = max(1, units[0].stop - units[0].start)
@@ -171,6 +175,12 @@ def davar_parts(log: xr.Dataset, *, samples: int = 2**24, **options: Any) -> lis
     while remaining := len(units) - edges[-1]:
         edges.append(edges[-1] + max(1, min(together, int(remaining * _MAX_SHARE_OF_REST))))
     return [slice(units[a].start, units[b - 1].stop) for a, b in pairwise(edges)]
+
+
+def _warn_unusable_channels(log: xr.Dataset) -> None:
+    """Warn of the channels that a surface does not have, where the calling function is called."""
+    for name, reason in find_unusable_channels(log).items():
+        warnings.warn(f"channel {name!r} is left out: {reason}", stacklevel=3)
 
 
 def davar_part(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +20,23 @@ from gyrostab.errors import (
     TimeError,
     UnitError,
 )
+from gyrostab.ingest.columns.headers import quantity_of
 from gyrostab.ingest.dataframe import from_dataframe, keyword_advice, warn_notes
 from gyrostab.ingest.uniform import advise_dates, as_uniform
-from gyrostab.schema import SIGNAL_LONG_NAMES, SIGNAL_UNITS, name_axes
+from gyrostab.schema import (
+    RESERVED_NAMES,
+    SIGNAL_LONG_NAMES,
+    SIGNAL_UNITS,
+    find_unusable_channels,
+    log_channels,
+    name_axes,
+)
 from gyrostab.store.lazy import hide_infinite
 from gyrostab.store.private import is_in_memory
 from gyrostab.store.read import MIN_LAZY_VALUES, make_variable_lazy
 from gyrostab.store.write import declare_counts
 from gyrostab.time.stamps import to_nanoseconds
-from gyrostab.units import HOUR, Unit, known_units, parse_unit
+from gyrostab.units import HOUR, INNER, Unit, known_units, parse_unit
 
 
 def as_log(data: Any) -> xr.Dataset:
@@ -60,7 +68,37 @@ def as_log(data: Any) -> xr.Dataset:
     if isinstance(data, pd.DataFrame | pd.Series):
         with _advise_conversion("gyrostab.from_dataframe(df, ...)"):
             return from_dataframe(data)
-    return as_uniform(_keep_on_disk(data) if isinstance(data, xr.Dataset) else data)
+    return as_uniform(_with_channels(_keep_on_disk(data)) if isinstance(data, xr.Dataset) else data)
+
+
+def _with_channels(log: xr.Dataset) -> xr.Dataset:
+    """Make variables of channels that are coordinates, and convert known units to the inner ones.
+
+    A unit that does not fit the name of its channel is kept, as is one that is not known.
+    """
+    coordinates = [
+        name
+        for name, array in log.coords.items()
+        if name not in log.dims
+        and name not in RESERVED_NAMES
+        and array.dims in (("time",), (f"time_{name}",))
+        and array.dtype.kind in "iuf"
+    ]
+    if coordinates:
+        log = log.reset_coords(coordinates)
+    unusable, converted = find_unusable_channels(log), {}
+    for name in log_channels(log):
+        variable, quantity = log.variables[name], quantity_of(name)
+        text = str(variable.attrs.get("units", INNER["number"]))
+        if name in unusable or text in INNER.values():
+            continue
+        with suppress(UnitError):
+            unit = parse_unit(text, quantity)
+            if quantity in (None, "number", unit.quantity):
+                attrs = {**variable.attrs, "units": INNER[unit.quantity]}
+                data = variable.data * unit.factor + unit.offset
+                converted[name] = xr.Variable(variable.dims, data, attrs)
+    return log.assign(converted) if converted else log
 
 
 @contextmanager

@@ -88,6 +88,35 @@ def log_channels(log: xr.Dataset) -> list[str]:
     ]
 
 
+def find_unusable_channels(log: xr.Dataset) -> dict[str, str]:
+    """Find the variables on the time of a log that cannot be used as channels, with reasons.
+
+    Examples
+    --------
+    >>> log = xr.Dataset({"pump": ("time", ["on", "off"]), "pressure": ("time", [1e5, 2e5])})
+    >>> find_unusable_channels(log)
+    {'pump': 'it holds text, not numbers'}
+    """
+    reasons: dict[str, str] = {}
+    for name, array in log.data_vars.items():
+        if name in RESERVED_NAMES or not {"time", f"time_{name}"}.intersection(array.dims):
+            continue
+        if array.ndim > 1:
+            (other, *_) = (dim for dim in array.dims if dim not in ("time", f"time_{name}"))
+            reasons[str(name)] = (
+                f"it has dimensions {array.dims}, and a channel lies on time only; make a channel "
+                f"of each part, for instance of log[{name!r}].isel({other}=0, drop=True)"
+            )
+        elif array.dtype.kind in "SUT":
+            reasons[str(name)] = "it holds text, not numbers"
+        elif array.dtype.kind not in "iuf":
+            reasons[str(name)] = (
+                f"it holds values of type {array.dtype}, not real numbers; convert them, with "
+                f"log[{name!r}].astype(float) if they are numbers"
+            )
+    return reasons
+
+
 def is_rate_of_change(name: str, product: xr.Dataset) -> bool:
     """Whether a channel of a product is the rate of change of another of its channels."""
     return name.endswith("_rate") and name.removesuffix("_rate") in product.data_vars

@@ -438,6 +438,38 @@ class TestLabels:
         np.testing.assert_allclose(result.pressure.values[0], 1e5 + slow_times[:10].mean())
 
     @pytest.mark.parametrize(
+        ("change", "reason"),
+        [
+            (lambda t: t.astype(object), "values of type object, .*astype.float"),
+            (lambda t: t.astype(str), "text, not numbers"),
+            (lambda t: t > 2.0, "values of type bool"),
+            (lambda t: t + 0j, "values of type complex128"),
+            (lambda t: t["time"].copy(), "values of type datetime64"),
+            (
+                lambda t: t.expand_dims({"axis": ["x"]}),
+                r"dimensions \('axis', 'time'\).*isel.axis=0",
+            ),
+        ],
+    )
+    @pytest.mark.parametrize("compute", [davar, davar_parts])
+    def test_warns_of_channels_that_are_left_out(self, change, reason, compute):
+        log = log_of(np.zeros(60), channels={"level": (np.arange(60.0), "1")})
+        log = log.assign(level=change(log.level), pump=log.level)
+        with pytest.warns(UserWarning, match=rf"^channel 'level' is left out: it \w+ {reason}"):
+            compute(log, window="20samples")
+        with pytest.warns(UserWarning, match="is left out"):
+            surface = davar(log, window="20samples")
+        assert "level" not in surface
+        assert surface.pump.values[0] == np.arange(20).mean()
+
+    def test_channel_without_units_has_none_in_the_surface(self):
+        log = log_of(np.zeros(60)).assign(temperature=("time", np.arange(60.0)))
+        surface = davar(log, window="20samples")
+        assert "units" not in surface.temperature.attrs
+        assert surface.temperature.values[0] == np.arange(20).mean()
+        assert "temperature_rate" not in surface
+
+    @pytest.mark.parametrize(
         ("options", "words"),
         [
             ({"window": "1h"}, "longer than the record .*; give a shorter window .--window"),

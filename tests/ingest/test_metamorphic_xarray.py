@@ -313,6 +313,41 @@ def test_infinite_values_are_missing():
     xr.testing.assert_equal(surface, expected)
 
 
+def test_channels_as_coordinates_are_channels(tmp_path):
+    """Also those on their own time, and where samples have been dropped."""
+    log = make().assign(pressure=("time_pressure", np.arange(60.0), {"units": "Pa"}))
+    log = log.assign_coords(time_pressure=log.time.values[::100])
+    expected = surface_of(log, rate=RATE)
+    marked = log.set_coords(["temperature", "pressure"])
+    xr.testing.assert_identical(surface_of(marked, rate=RATE), expected)
+    stored = gyrostab.open_log(gyrostab.to_netcdf(marked, tmp_path / "log.nc"))
+    assert {"temperature", "pressure"} <= set(stored.data_vars)
+    thinned = as_log(stamped(marked).isel(time=np.delete(np.arange(SIZE), 7)))
+    assert np.flatnonzero(np.isnan(thinned.temperature.values)).tolist() == [7]
+
+
+@pytest.mark.parametrize(
+    ("name", "units", "value", "inner", "expected"),
+    [
+        ("temperature", "degC", 20.0, "degree_Celsius", 20.0),
+        ("temperature_case", "K", 293.15, "degree_Celsius", 20.0),
+        ("accel_x", "m s-2", 9.80665, "g", 1.0),
+        ("rotation_rate", "rpm", 10.0, "degree s-1", 60.0),
+        ("mag_x", "G", 0.5, "uT", 50.0),
+        ("probe", "bar", 2.0, "Pa", 2e5),
+        ("flow", "L/min", 3.0, "L/min", 3.0),
+        ("temperature", "V", 3.0, "V", 3.0),
+    ],
+)
+@pytest.mark.parametrize("chunked", [False, True])
+def test_units_of_channels_are_converted(name, units, value, inner, expected, chunked):
+    values = xr.Variable("time", np.full(SIZE, value), {"units": units})
+    log = as_log(make().assign({name: values.chunk(time=999) if chunked else values}))
+    assert log[name].units == inner
+    np.testing.assert_allclose(log[name].values, expected)
+    assert (log[name].chunks is not None) == chunked
+
+
 @pytest.mark.parametrize("axis", [["y"], np.array(["y"]), xr.DataArray(["y"]), {"y": 1}.keys()])
 def test_axes_are_selected_by_any_sequence(axis):
     assert gyrostab.davar(make(), window="8s", axis=list(axis)).axis.values.tolist() == ["y"]

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.schema import log_channels, signal_name
+from gyrostab.schema import find_unusable_channels, log_channels, signal_name
 from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_index, grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
@@ -118,12 +118,12 @@ def align_channels(log: xr.Dataset) -> Aligned:
     >>> aligned.notes[0]
     'channel ramp: its stamps are 3 ms after those of the gyro; each sample has the nearest value'
     """
-    unused: dict[str, str] = {}
+    unused = find_unusable_channels(log)
     notes: list[str] = []
     for name in log_channels(log):
-        if not np.issubdtype(log[name].dtype, np.number):
-            unused[name] = "it holds text, not numbers"
-        elif log[name].dims != ("time",):
+        if name in unused:
+            continue
+        if log[name].dims != ("time",):
             placed = _place_channel(log, name)
             if isinstance(placed, str):
                 unused[name] = placed

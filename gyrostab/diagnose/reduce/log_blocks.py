@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.reduce.aligned_channels import interpolate_linearly
-from gyrostab.schema import log_channels, signal_name
+from gyrostab.schema import find_unusable_channels, log_channels, signal_name
 from gyrostab.simulate.drivers import make_source
 from gyrostab.store import lazy
 from gyrostab.time.stamps import to_nanoseconds
@@ -33,7 +33,8 @@ class BlockBatch(NamedTuple):
 
 def numeric_channels(log: xr.Dataset) -> tuple[list[str], list[str]]:
     """Return the channels on the log's own time, and those with their own time stamps."""
-    names = [name for name in log_channels(log) if np.issubdtype(log[name].dtype, np.number)]
+    unusable = find_unusable_channels(log)
+    names = [name for name in log_channels(log) if name not in unusable]
     on_log_time = [name for name in names if log[name].dims == ("time",)]
     return on_log_time, [name for name in names if name not in on_log_time]
 
