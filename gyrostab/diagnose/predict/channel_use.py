@@ -10,6 +10,7 @@ import xarray as xr
 from gyrostab.diagnose.predict.windows import channel_units
 from gyrostab.diagnose.reduce.aligned_channels import ROTATION_WAVE_PREFIXES
 from gyrostab.physics.registry import effects
+from gyrostab.wording import join_words
 
 #: Least share of the blocks in which a channel must have values. Design choice.
 MIN_BLOCK_SHARE = 0.5
@@ -22,11 +23,22 @@ CALIBRATION_CHANNELS = ("vibration", "temperature", "rotation_rate")
 def missing_channel_reason(channels: Collection[str], blocks: xr.Dataset) -> str:
     """Explain why an effect can use none of its channels."""
     unused: Mapping[str, str] = blocks.attrs.get("unused_channels", {})
-    for name in channels:
+    bases = {channel.rstrip("0123456789").rstrip("_") for channel in channels}
+    similar = [
+        name
+        for name in (*channel_units(blocks), *unused)
+        if name in bases or name.startswith(tuple(f"{base}_" for base in bases))
+    ]
+    for name in dict.fromkeys((*channels, *similar)):
         if name in unused:
             return f"the channel {name} is not used: {unused[name]}"
         if problem := _describe_problem(name, blocks):
             return f"the channel {name} is not used: {problem}"
+    if len(similar) < len(channels) and similar:
+        return (
+            f"it needs {len(channels)} channels such as {join_words(list(channels))}, and the "
+            f"recording has only {join_words(similar)}"
+        )
     return f"the recording has no channel {' or '.join(channels)}"
 
 

@@ -243,6 +243,19 @@ def test_reason_of_an_effect_names_the_unused_channel():
     assert channel["name"] == "ramp"
 
 
+@pytest.mark.parametrize("name", ["temperature", "temperature_case"])
+def test_reason_of_a_difference_names_the_only_temperature(name):
+    log = kicked(0.0)
+    log = log.assign({name: ("time", 20.0 + np.arange(log.sizes["time"]) / 1e4)})
+    log[name].attrs["units"] = "degree_Celsius"
+    _, candidates, reasons = candidates_of(log)
+    assert "shupe" in {candidate.effect for candidate in candidates}
+    assert reasons["thermal_gradient"] == (
+        "not identifiable: it needs 2 channels such as temperature and temperature_2, and the "
+        f"recording has only {name}"
+    )
+
+
 @pytest.mark.parametrize(
     ("name", "unit", "values", "reason"),
     [
