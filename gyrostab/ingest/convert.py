@@ -30,6 +30,7 @@ from gyrostab.schema import (
     find_unusable_channels,
     log_channels,
     name_axes,
+    refuse_multi_index,
 )
 from gyrostab.store.lazy import hide_infinite
 from gyrostab.store.private import is_in_memory
@@ -210,6 +211,12 @@ def from_dataarray(
 
 def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[xr.Dataset, bool]:
     """Convert an array to a log with unchecked time; also return whether it has increments."""
+    if not isinstance(da, xr.DataArray):
+        raise SchemaError(
+            f"this is a {type(da).__name__}; give an xarray.DataArray, for instance the variable "
+            "of a Dataset that holds the gyro, dataset['gyro']"
+        )
+    refuse_multi_index(da, "DataArray")
     if "unit_label" in da.attrs:
         raise SchemaError(
             f"this is {da.attrs.get('long_name', da.name)} by window, not a gyro signal; give the "

@@ -215,6 +215,13 @@ def _check_index(table: pd.DataFrame) -> pd.DatetimeIndex:
     """Return the stamps in UTC; raise an error if they run backwards."""
     index: Any = table.index
     columns: Any = table.columns
+    if isinstance(columns, pd.MultiIndex):
+        raise SchemaError(
+            f"the columns of the DataFrame have {columns.nlevels} levels; join them to one name "
+            "each: df.columns = df.columns.map('_'.join)"
+        )
+    if isinstance(index, pd.MultiIndex) and (advice := _advise_levels(index)):
+        raise SchemaError(f"the index of the DataFrame has {index.nlevels} levels; {advice}")
     if not isinstance(index, pd.DatetimeIndex):
         dated = [repr(name) for name, kind in table.dtypes.items() if kind.kind == "M"]
         advice = (
@@ -239,6 +246,19 @@ def _check_index(table: pd.DataFrame) -> pd.DatetimeIndex:
             "df.sort_index()"
         )
     return pd.DatetimeIndex(index)
+
+
+def _advise_levels(index: pd.MultiIndex) -> str:
+    """Return the calls that remove a level without times of an index of several; or ""."""
+    dated = [isinstance(level, pd.DatetimeIndex) for level in index.levels]
+    if sum(dated) != 1:
+        return ""
+    number = dated.index(False)
+    level = number if index.names[number] is None else str(index.names[number])
+    return (
+        f"take one part of the other, df.xs({index.levels[number][0]!r}, level={level!r}), or "
+        f"make a column of each part of a Series, series.unstack({level!r})"
+    )
 
 
 def warn_notes(log: xr.Dataset) -> None:

@@ -17,6 +17,7 @@ from gyrostab.schema.checks import find_unusable_channels as find_unusable_chann
 from gyrostab.schema.checks import is_rate_of_change as is_rate_of_change
 from gyrostab.schema.checks import log_channels as log_channels
 from gyrostab.schema.checks import name_axes as name_axes
+from gyrostab.schema.checks import refuse_multi_index as refuse_multi_index
 from gyrostab.schema.checks import require_dataset as require_dataset
 from gyrostab.schema.checks import signal_name as signal_name
 from gyrostab.schema.checks import texts as texts

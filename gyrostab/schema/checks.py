@@ -135,6 +135,27 @@ def require_dataset(dataset: Any, kind: str) -> None:
             f"{_MAKERS[kind]} makes one, and gyrostab.from_dataframe and gyrostab.from_dataarray "
             "make logs"
         )
+    refuse_multi_index(dataset, kind)
+
+
+def refuse_multi_index(data: xr.Dataset | xr.DataArray, kind: str) -> None:
+    """Raise `SchemaError` where a MultiIndex of xarray takes the place of axis or time."""
+    for dim, index in data.xindexes.items():
+        levels = list(index.index.names) if isinstance(index, xr.indexes.PandasMultiIndex) else []
+        dates = [name for name in levels if data[name].dtype.kind == "M"]
+        if dim not in data.dims or not {"axis", "time"}.intersection([dim, *levels]) or not levels:
+            continue
+        if dim == "time":
+            level = dates[0] if dates else levels[0]
+            advice = f".reset_index('time').set_index(time={level!r})"
+        elif dim == "axis":
+            advice = ".reset_index('axis', drop=True).assign_coords(axis=[...])"
+        else:
+            advice = f".unstack({dim!r})"
+        raise SchemaError(
+            f"the dimension {dim!r} of the {kind} has a MultiIndex of {', '.join(levels)}; undo it "
+            f"with {advice}"
+        )
 
 
 def _require_variables(dataset: xr.Dataset, kind: str, dims: Mapping[str, tuple[str, ...]]) -> None:

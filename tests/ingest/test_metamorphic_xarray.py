@@ -826,3 +826,53 @@ def test_advice_for_other_dates_gives_a_log(calendar):
         gyrostab.from_dataframe(df)
     converted = eval(str(raised.value).split("convert it: ")[1], {"df": df})
     np.testing.assert_array_equal(gyrostab.from_dataframe(converted).time.values, expected)
+
+
+def test_advice_for_an_index_of_several_levels_gives_a_log():
+    log = make(record(size=300))
+    time = pd.DatetimeIndex(log.time.values)
+    table = pd.DataFrame(log.rate.values.T, time, ["gyro_x", "gyro_y"])
+    runs = table.set_index(pd.MultiIndex.from_arrays([["a"] * 300, time], names=["run", None]))
+    stacked = log.rate.to_series()
+    for data, expression in (
+        (runs, r"df.xs\('a', level='run'\)"),
+        (stacked, r"series.unstack\('axis'\)"),
+        (table.T.set_index([["gyro"] * 2, ["x", "y"]]).T, r"df.columns.map\('_'.join\)"),
+    ):
+        with pytest.raises(
+            SchemaError, match=rf"^the (index|columns) of .* 2 levels; .*{expression}"
+        ):
+            gyrostab.from_dataframe(data, units="deg/h")
+        call = re.search(expression, str(_error_of(gyrostab.from_dataframe, data)))[0]
+        changed = eval(call, {"df": data, "series": data})
+        if isinstance(changed, pd.Index):
+            changed = data.set_axis(changed, axis=1)
+        made = gyrostab.from_dataframe(changed, units="deg/h")
+        np.testing.assert_array_equal(made.rate, log.rate)
+
+
+def _error_of(call, *arguments) -> Exception:
+    with pytest.raises(GyrostabError) as refused:
+        call(*arguments)
+    return refused.value
+
+
+@pytest.mark.parametrize("as_array", [False, True])
+def test_advice_for_a_multi_index_gives_a_log(as_array):
+    log = make(record(size=300))
+    stamps = log.time.values
+    bare = log.drop_vars("time").assign_coords(stamp=("time", stamps), run=("time", ["a"] * 300))
+    named = stamped(log).assign_coords(sensor=("axis", ["g", "g"]))
+    for data, expected in (
+        (stamped(log).stack(sample=("axis", "time")), "sample"),
+        (bare.set_index(time=["run", "stamp"]), "time"),
+        (named.rename_vars(axis="label").set_index(axis=["sensor", "label"]), "axis"),
+    ):
+        convert = gyrostab.from_dataarray if as_array else as_log
+        given = data.rate if as_array else data
+        message = str(_error_of(convert, given))
+        assert f"dimension {expected!r} of the" in message
+        call = message.partition("undo it with ")[2].replace("[...]", "['x', 'y']")
+        made = convert(eval(f"given{call}", {"given": given}))
+        np.testing.assert_array_equal(made.rate, log.rate)
+        np.testing.assert_array_equal(made.time, stamps)

@@ -17,11 +17,8 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.base import Effect
 from gyrostab.physics.registry import effects
-from gyrostab.wording import join_words
 
 BEYOND = 0.05  # probability of a larger size
-#: What an effect without a limit would have shown in, by the kind of its mismatches.
-_EVIDENCE = {"distribution": "anomalous samples", "spectrum": "spectral lines"}
 MAX_VARIANTS = 9  # evenly spread over the grid of a mean: enough for a smooth mixture
 
 
@@ -32,8 +29,7 @@ def find_upper_limits(identifications: Identifications) -> dict[str, dict[str, A
     -------
     dict of str to dict
         ``upper_limit``, 95 %, of the effect's first size in means, powers or cross-spectra, the
-        largest over the axes; NaN where the record has none. Its ``unit``, and the ``reason``:
-        ``"below limit"``, or why there is no limit.
+        largest over the axes; NaN where the record has none. Its ``unit``, and the ``reason``.
     """
     named = {
         identification.effect
@@ -52,19 +48,19 @@ def _limit_effect(kind: type[Effect], identifications: Identifications) -> dict[
     if kind.name in identifications.reasons:
         reason = identifications.reasons[kind.name]
         return {"upper_limit": math.nan, "unit": unit, "reason": reason}
-    candidates = [item for item in identifications.candidates if item.effect == kind.name]
     limits = [
         _limit_candidate(candidate, identifications.state)
-        for candidate in candidates
-        if candidate.statistic.has_course and candidate.statistic.has_size
+        for candidate in identifications.candidates
+        if candidate.effect == kind.name
+        and candidate.statistic.has_course
+        and candidate.statistic.has_size
     ]
     by_column: dict[str, float] = {}  # the largest
     for value, column in limits:
         if math.isfinite(value):
             by_column[column] = max(value, by_column.get(column, value))
     if not by_column:
-        obstacle = "free noise does as much" if limits else _explain_no_limit(candidates)
-        reason = f"not identifiable: {obstacle}"
+        reason = "not identifiable: free noise does as much" if limits else "below limit"
         return {"upper_limit": math.nan, "unit": unit, "reason": reason}
     column = next((name for name in units if name in by_column), next(iter(by_column)))
     return {
@@ -72,13 +68,6 @@ def _limit_effect(kind: type[Effect], identifications: Identifications) -> dict[
         "unit": units.get(column, unit),
         "reason": "below limit",
     }
-
-
-def _explain_no_limit(candidates: Sequence[Candidate]) -> str:
-    """Explain why an effect has no limit that shows in statistics without sizes by block."""
-    views = dict.fromkeys(candidate.statistic.view for candidate in candidates)
-    evidence = dict.fromkeys(_EVIDENCE.get(view, "coherence with another signal") for view in views)
-    return f"it was not seen, and no limit is computed from {join_words(list(evidence))}"
 
 
 def _limit_candidate(candidate: Candidate, state: State) -> tuple[float, str]:

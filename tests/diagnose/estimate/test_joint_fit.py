@@ -235,11 +235,6 @@ def test_effects_not_found_have_a_limit_or_a_reason(shaken):
     assert 0.0 < limits["vibration_noise"]["upper_limit"] < 1e-3
     assert np.isnan(limits["feedback_reset"]["upper_limit"])
     assert limits["feedback_reset"]["reason"].startswith("not identifiable")
-    for limit in limits.values():
-        assert np.isnan(limit["upper_limit"]) == (limit["reason"] != "below limit")
-    for name, evidence in (("spikes", "anomalous samples"), ("spectral_line", "spectral lines")):
-        assert limits[name]["reason"].startswith("not identifiable: it was not seen, and no limit")
-        assert limits[name]["reason"].endswith(f"is computed from {evidence}")
 
 
 def test_size_of_a_line():
