@@ -40,7 +40,7 @@ from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import HOUR, INNER, Unit, known_units, parse_unit
 
 
-def as_log(data: Any) -> xr.Dataset:
+def as_log(data: Any, *, converts_units: bool = True) -> xr.Dataset:
     """Convert any supported object to a regular log; functions that take a log call this first.
 
     Parameters
@@ -49,6 +49,8 @@ def as_log(data: Any) -> xr.Dataset:
         A log, also after xarray operations (see `gyrostab.ingest.uniform.as_uniform`); a signal
         with units on ``time`` or ``(axis, time)``; a table with a DatetimeIndex and units in the
         names of its columns or in ``attrs["units"]``.
+    converts_units : bool
+        Convert the known units of channels of a Dataset to the inner ones.
 
     Returns
     -------
@@ -69,14 +71,14 @@ def as_log(data: Any) -> xr.Dataset:
     if isinstance(data, pd.DataFrame | pd.Series):
         with _advise_conversion("gyrostab.from_dataframe(df, ...)"):
             return from_dataframe(data)
-    return as_uniform(_with_channels(_keep_on_disk(data)) if isinstance(data, xr.Dataset) else data)
+    if isinstance(data, xr.Dataset):
+        data = _reset_channels(_keep_on_disk(data))
+        data = _convert_channels(data) if converts_units else data
+    return as_uniform(data)
 
 
-def _with_channels(log: xr.Dataset) -> xr.Dataset:
-    """Make variables of channels that are coordinates, and convert known units to the inner ones.
-
-    A unit that does not fit the name of its channel is kept, as is one that is not known.
-    """
+def _reset_channels(log: xr.Dataset) -> xr.Dataset:
+    """Make variables of channels that are coordinates."""
     coordinates = [
         name
         for name, array in log.coords.items()
@@ -85,8 +87,14 @@ def _with_channels(log: xr.Dataset) -> xr.Dataset:
         and array.dims in (("time",), (f"time_{name}",))
         and array.dtype.kind in "iuf"
     ]
-    if coordinates:
-        log = log.reset_coords(coordinates)
+    return log.reset_coords(coordinates) if coordinates else log
+
+
+def _convert_channels(log: xr.Dataset) -> xr.Dataset:
+    """Convert the units of channels to the inner ones.
+
+    A unit that does not fit the name of its channel is kept, as is one that is not known.
+    """
     unusable, converted = find_unusable_channels(log), {}
     for name in log_channels(log):
         variable, quantity = log.variables[name], quantity_of(name)

@@ -142,7 +142,7 @@ def _read_frame(
         )
     units = frame.attrs.get("units") if units is None else units
     headers = [str(column) for column in table.columns]
-    renamed = dict(map or {})
+    renamed = {str(key): name for key, name in (map or {}).items()}
     if not isinstance(units, Mapping):
         keys = {key.strip().lower() for key in renamed}
         lows = {header: split_header(header)[0].lower() for header in headers}

@@ -85,6 +85,8 @@ def make_log(
             f"values of shape {data.shape} do not fit the axes {names}; give values as (axis, "
             "time) and one name per axis"
         )
+    if len(set(names)) < len(names):
+        raise OptionError(f"axis={names}: give each axis another name")
     if parsed.factor != 1.0:
         data = data * parsed.factor
     check_span(stamp_ns(start), rate, data.shape[1], "make_log")

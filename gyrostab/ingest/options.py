@@ -58,7 +58,11 @@ class ReadOptions:
             if value is not None:
                 stamp_ns(value, f"--{name}")
         for name in ("map", "unit"):
-            object.__setattr__(self, name, dict(getattr(self, name) or {}))
+            given = {str(key): value for key, value in (getattr(self, name) or {}).items()}
+            for key, value in given.items():
+                if not isinstance(value, str):
+                    raise OptionError(f"--{name} {key}: {value!r} is not a text; give one")
+            object.__setattr__(self, name, given)
         object.__setattr__(self, "limits", check_limits(self.limits))
         object.__setattr__(self, "channel", self.channel or ())
         if isinstance(self.channel, str | Path):

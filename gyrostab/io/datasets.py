@@ -126,7 +126,7 @@ def _compute_time_axes(dataset: Any) -> xr.Dataset:
             and set(signal.dims) <= {"axis", "time"}
             and signal.attrs.get("units") == units
         ):
-            return as_log(dataset)
+            return as_log(dataset, converts_units=False)
     return dataset
 
 

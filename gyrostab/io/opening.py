@@ -180,7 +180,7 @@ def open_content(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Da
 
 def _restore_log(log: xr.Dataset, path: str | os.PathLike[str]) -> xr.Dataset:
     try:
-        return as_log(log)
+        return as_log(log, converts_units=False)
     except (SchemaError, TimeError) as error:
         log.close()
         raise type(error)(f"{path}: {error}") from error

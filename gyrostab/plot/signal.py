@@ -38,7 +38,7 @@ def plot_signal(
     log: xr.Dataset,
     *,
     axis: str | None = None,
-    channels: Sequence[str] | None = None,
+    channels: str | Sequence[str] | None = None,
     columns: int = 1500,
     width: float = PAGE_MM,
 ) -> Figure:
@@ -53,7 +53,7 @@ def plot_signal(
         Regular log, ``rate`` [degree hour-1] or ``angle`` [degree] with dims ``(axis, time)``.
     axis : str, optional
         Draw this axis only.
-    channels : sequence of str, optional
+    channels : str or sequence of str, optional
         Channels to draw; all by default.
     columns : int
         Number of columns to which a long record is reduced.
@@ -80,6 +80,7 @@ def plot_signal(
     log = as_log(log)
     name = signal_name(log)
     axes, available = axis_names(log, axis), log_channels(log)
+    channels = [channels] if isinstance(channels, str) else channels
     shown = available if channels is None else list(channels)
     if missing := [channel for channel in shown if channel not in available]:
         raise OptionError(

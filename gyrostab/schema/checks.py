@@ -141,7 +141,11 @@ def require_dataset(dataset: Any, kind: str) -> None:
 def refuse_multi_index(data: xr.Dataset | xr.DataArray, kind: str) -> None:
     """Raise `SchemaError` where a MultiIndex of xarray takes the place of axis or time."""
     for dim, index in data.xindexes.items():
-        levels = list(index.index.names) if isinstance(index, xr.indexes.PandasMultiIndex) else []
+        levels = (
+            list(map(str, index.index.names))
+            if isinstance(index, xr.indexes.PandasMultiIndex)
+            else []
+        )
         dates = [name for name in levels if data[name].dtype.kind == "M"]
         if dim not in data.dims or not {"axis", "time"}.intersection([dim, *levels]) or not levels:
             continue

@@ -65,6 +65,7 @@ def test_infinite_values_are_missing(to_array):
             MissingUnitError,
             r"\{'vibration': \(values, 'g'\)\}",
         ),
+        ({"values": [VALUES] * 2, "axis": ["x", "x"]}, OptionError, "give each axis another name"),
         ({"channels": {"pump": (["on"] * 50, "1")}}, OptionError, "of channel 'pump' are of type"),
     ],
 )

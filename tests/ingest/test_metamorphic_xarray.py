@@ -348,6 +348,13 @@ def test_units_of_channels_are_converted(name, units, value, inner, expected, ch
     assert (log[name].chunks is not None) == chunked
 
 
+def test_a_file_keeps_the_units_of_channels(tmp_path):
+    log = make().assign(temperature_case=("time", np.full(SIZE, 293.15), {"units": "K"}))
+    stored = gyrostab.open_log(gyrostab.to_netcdf(log, tmp_path / "log.nc"))
+    assert stored.temperature_case.units == "K"
+    np.testing.assert_array_equal(stored.temperature_case, 293.15)
+
+
 @pytest.mark.parametrize("axis", [["y"], np.array(["y"]), xr.DataArray(["y"]), {"y": 1}.keys()])
 def test_axes_are_selected_by_any_sequence(axis):
     assert gyrostab.davar(make(), window="8s", axis=list(axis)).axis.values.tolist() == ["y"]
@@ -876,3 +883,13 @@ def test_advice_for_a_multi_index_gives_a_log(as_array):
         made = convert(eval(f"given{call}", {"given": given}))
         np.testing.assert_array_equal(made.rate, log.rate)
         np.testing.assert_array_equal(made.time, stamps)
+
+
+def test_columns_of_a_table_are_mapped_by_any_label():
+    log = make(record(size=300))
+    table = pd.DataFrame(log.rate.values.T, log.time.values)
+    made = gyrostab.from_dataframe(table, units="deg/h", map={0: "gyro_x", 1: "gyro_y"})
+    np.testing.assert_array_equal(made.rate, log.rate)
+    for wrong in ({"map": {0: 1}}, {"units": {"gyro": None}}):
+        with pytest.raises(OptionError, match=r"0: 1 is not a text|gyro: None is not a text"):
+            gyrostab.from_dataframe(table, **{"units": "deg/h", **wrong})

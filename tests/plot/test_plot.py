@@ -60,7 +60,7 @@ def test_signal_of_chosen_axis_and_channels():
     figure = plot_signal(synthetic.log(), axis="z", channels=["temperature"])
     assert [ax.get_ylabel() for ax in figure.axes] == ["z [deg/h]", "temperature\n[°C]"]
     with pytest.raises(OptionError, match="channel mud is not in the log; it has vibration"):
-        plot_signal(synthetic.log(), channels=["mud"])
+        plot_signal(synthetic.log(), channels="mud")
     with pytest.raises(OptionError, match="axis 'q' is not in the data; it has x, y, z"):
         plot_signal(synthetic.log(), axis="q")
 
