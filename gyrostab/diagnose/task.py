@@ -216,7 +216,6 @@ def take_lines_at_rest(task: Task, blocks: xr.Dataset, moving: NDArray[np.bool_]
         task.log, blocks, moving | ~has_data, restart_gap=task.restart_gap, progress=task.progress
     )
     lines = {name: at_rest[name] for name in ("line_power", "line_weight")}
-    if "sine_nats" in blocks:
-        stays = xr.DataArray(~moving.any(axis=1), dims="axis")
-        lines["sine_nats"] = blocks["sine_nats"].where(stays, -np.inf)
+    stays = xr.DataArray(~moving.any(axis=1), dims="axis")
+    lines["sine_nats"] = blocks["sine_nats"].where(stays, -np.inf)
     return blocks.assign(lines)

@@ -100,8 +100,13 @@ def records(base: xr.Dataset, count: int, rng: np.random.Generator, **options: A
             rng.normal(0.0, np.sqrt(24.0 / f["samples"]), (count, axes, block_count)),
         ),
     }
-    if pairs:
-        data["cross"] = (("record", "pair", "block", "band"), np.stack(cross, axis=1))
+    no_pairs = np.empty((count, 0, *shape.shape[1:]), np.complex128)
+    data["cross"] = (
+        ("record", "pair", "block", "band"),
+        np.stack(cross, axis=1) if pairs else no_pairs,
+    )
+    data["quantization_step"] = ("axis", np.zeros(axes))
+    data |= {name: ("restart", np.empty(0)) for name in ("restart_begin", "restart_end")}
     for name in ("outliers", "repeats", "extremes", "zeros"):
         data[name] = (plane, rng.poisson(1e-5, (count, axes, block_count)))
     edges = np.arange(block_count + 1) * f["block_s"]

@@ -66,8 +66,7 @@ def predict_baseline(
     )
     usable_blocks = blocks.copy()
     for name in ("mean", "power", "cross"):
-        if name in usable_blocks:
-            usable_blocks[name] = usable_blocks[name].where(xr.DataArray(keep, dims="block"))
+        usable_blocks[name] = usable_blocks[name].where(xr.DataArray(keep, dims="block"))
     state = initial_state(usable_blocks, baseline, settings=identifications.state.settings)
     # for each column in the model, whether it belongs to an effect that is left out
     is_left_out: dict[tuple[str, str], list[bool]] = {}

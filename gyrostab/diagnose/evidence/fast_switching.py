@@ -77,11 +77,11 @@ def switching_evidence(
     given: Array | None = None,
     settings: Settings = DEFAULTS,
 ) -> SwitchingEvidence | None:
-    """Compute the evidence of two levels in means over sub-blocks; None without, or with too few.
+    """Compute the evidence of two levels in means over sub-blocks; None with too few of them.
 
     The given columns (block, sub_block, column) of effects are in the model in both cases.
     """
-    if "sub_block_mean" not in data or "record" in data.dims:
+    if "record" in data.dims:
         return None
     values, variance, merged = _sub_block_means(data, baseline, axis)
     shape = values.shape

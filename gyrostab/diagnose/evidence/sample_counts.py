@@ -46,8 +46,6 @@ def has_coarse_grid(blocks: xr.Dataset) -> NDArray[np.bool_]:
     >>> has_coarse_grid(xr.Dataset(one, coords=bands))
     array([ True, False])
     """
-    if "quantization_step" not in blocks:
-        return np.zeros(blocks.sizes["axis"], np.bool_)
     return np.asarray(
         blocks["quantization_step"].values > _MIN_COARSE_SCATTERS * quiescent_scatter(blocks)
     )
@@ -147,9 +145,7 @@ class CountEvidence:
         """Compute the expected counts from all null records."""
         moments = {}
         for name in EXPECTED:
-            counts = [chunk[name].values.astype(np.float64) for chunk in nulls if name in chunk]
-            if not counts:
-                continue
+            counts = [chunk[name].values.astype(np.float64) for chunk in nulls]
             values = np.concatenate(counts)  # (record, axis, block)
             if name == "kurtosis":
                 good = np.isfinite(values)

@@ -167,7 +167,7 @@ def _score_null_records(
     records = 0
     for chunk in nulls:
         chunks.append(compute_evidence(by_chunk, chunk, state, folds, rng=rng))
-        small.append(chunk[[name for name in ("mean", *EXPECTED) if name in chunk]])
+        small.append(chunk[["mean", *EXPECTED]])
         records += chunk.sizes["record"]
         progress("naming", 0, records)
     rounded = rounded_rates(state.blocks, state.baseline, settings=state.settings)

@@ -42,7 +42,7 @@ def mean_columns(variant: Variant, row: int) -> list[Array]:
 def free_covariance(state: State, axes: tuple[str, ...], density: Array) -> State:
     """Add any covariance of these axes with the others of this density, (block, band)."""
     nothing = np.zeros_like(density)
-    for pair in pair_rows(state.blocks) if "cross" in state.blocks else []:
+    for pair in pair_rows(state.blocks):
         if set(pair) & set(axes):
             real_and_imaginary = [
                 np.concatenate([density, nothing], axis=-1),
@@ -122,8 +122,7 @@ def drop_changed_tails(
     left_out: dict[str, tuple[NDArray[np.bool_], float]]
     left_out = {"kurtosis": (unusual, np.nan), "outliers": (turns, 0)}
     for name, (where, replacement) in left_out.items():
-        if name in out:
-            out[name].values = np.where(where, replacement, out[name].values)
+        out[name].values = np.where(where, replacement, out[name].values)
     return out
 
 

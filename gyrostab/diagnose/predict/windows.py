@@ -56,8 +56,6 @@ def make_windows(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
     means = dict(zip(axes, map(fill_linearly, measured(blocks, "mean").values), strict=True))
 
     def spans(name: str) -> Array:
-        if f"{name}_begin" not in blocks:
-            return np.empty((0, 2))
         return np.stack(
             [blocks[f"{name}_begin"].values, blocks[f"{name}_end"].values], axis=1
         ).astype(np.float64)

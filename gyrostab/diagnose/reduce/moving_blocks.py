@@ -126,11 +126,9 @@ def without_motion(
     """
     same = f"{blocks.attrs['block_samples']}samples"
     out = reduce_log(log, block=same, restart_gap=restart_gap, left_out=moving, progress=progress)
-    out = out.assign(
-        {f"measured_{name}": blocks[name] for name in _KEPT_STATISTICS if name in blocks}
-    )
-    out = out.drop_dims([dim for dim in ("gap", "restart") if dim in out.dims]).assign(
-        {name: blocks[name] for name in ("gap_begin", "gap_end", "restart_begin", "restart_end")}
+    out = out.drop_dims(["gap", "restart"]).assign(
+        {f"measured_{name}": blocks[name] for name in _KEPT_STATISTICS}
+        | {name: blocks[name] for name in ("gap_begin", "gap_end", "restart_begin", "restart_end")}
     )
     out["moving"] = (
         ("axis", "block"),

@@ -76,7 +76,7 @@ def _with_shared_lines(
         for component in components_of(identified)
         if component.statistic.is_line and component.place >= 0
     ]
-    if "cross" not in blocks or len(lines) < 2:
+    if len(lines) < 2:
         return after
     observed, shape = (blocks[name].values for name in ("cross", "cross_shape"))
     expected = after["cross"].values if "cross" in after else np.zeros_like(observed)

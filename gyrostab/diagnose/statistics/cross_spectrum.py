@@ -74,7 +74,7 @@ class CrossSpectrum(Statistic):
 
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
         """Return noise that two axes share, of any phase and spectrum."""
-        if "cross" not in blocks or not blocks.sizes["pair"]:
+        if not blocks.sizes["pair"]:
             return []
         return [Candidate("~cov", self, (), _covariance_variants(blocks.sizes["band"]))]
 
@@ -84,7 +84,7 @@ class CrossSpectrum(Statistic):
         ``ratio`` and ``estimate`` are the coherency, in bands and in total. Three axes or more have
         a row of all pairs together, over all bands in phase.
         """
-        if "cross" not in blocks or blocks.sizes.get("pair", 0) == 0:
+        if not blocks.sizes["pair"]:
             return None
         axes = [str(axis) for axis in blocks["axis"].values]
         left, right = pair_indices(blocks)
@@ -128,7 +128,7 @@ class CrossSpectrum(Statistic):
     def design(self, case: Prospect) -> Iterator[Variant]:
         """Yield cross-densities per product of the factors of both axes."""
         prediction = case.prediction
-        if not prediction.coherent or prediction.line is not None or "cross" not in case.blocks:
+        if not prediction.coherent or prediction.line is not None:
             return
         for name, density in prediction.spectrum.items():
             yield Variant(case.values, (name,), with_axis(density)[None], squared=True)

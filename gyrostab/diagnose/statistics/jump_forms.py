@@ -27,8 +27,8 @@ def is_free_jump(component: Component, state: State) -> bool:
     """Return whether a component is a jump at a free instant, not at a restart."""
     if component.candidate.effect != _JUMP or not component.is_step:
         return False
-    ends = state.blocks["restart_end"].values if "restart_end" in state.blocks else np.empty(0)
-    return not np.isclose(ends, float(component.variant.values[TIME_PARAMETER])).any()
+    time = float(component.variant.values[TIME_PARAMETER])
+    return not np.isclose(state.blocks["restart_end"].values, time).any()
 
 
 def jump_competitors(

@@ -165,7 +165,7 @@ class Power(Statistic):
     def condition(self, state: State, component: Component) -> State:
         axis = component.row[0]
         row = state.axes.index(axis)
-        if self.is_filter(component.variant) and "line_power" in state.blocks:
+        if self.is_filter(component.variant):
             expected = expected_lines(state.baseline, state.blocks["line_frequency"].values)[row]
             blocks, stopped = undo_filter(
                 state.blocks, axis, component.candidate.effect, component.variant.values, expected

@@ -71,8 +71,6 @@ class Restart(Statistic):
 
 def _restart_blocks(blocks: xr.Dataset) -> np.ndarray:
     """Return the first block after each restart, by most of its samples, with blocks before it."""
-    if "restart_end" not in blocks:
-        return np.empty(0, np.int64)
     begin, end = blocks["begin"].values, blocks["end"].values
     lost, back = (blocks[name].values[:, None] for name in ("restart_begin", "restart_end"))
     first_blocks = (end - back <= np.maximum(lost - begin, 0.0)).sum(axis=1)

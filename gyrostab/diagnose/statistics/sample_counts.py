@@ -233,7 +233,7 @@ def _count_evidence(
         samples = state.blocks["samples"].values.sum(axis=1).astype(np.float64)
         nats = np.where(count_evidence.rounded, samples, 0.0) if is_rounded else 0.0
         return np.broadcast_to(nats, (records, len(state.axes)))
-    if name not in data or name not in count_evidence.of:
+    if name not in count_evidence.of:
         return np.zeros((records, len(state.axes)))
     values = data[name].values.astype(np.float64)
     values = values if values.ndim == 3 else values[None]
@@ -285,5 +285,8 @@ def mask_anomalous_blocks(
     if not anomalous.any():
         return blocks
     usable = xr.DataArray(~anomalous, dims=("axis", "block"))
-    masked = blocks.assign(mean=blocks["mean"].where(usable), power=blocks["power"].where(usable))
-    return masked.assign(cross=cross_without(blocks, anomalous)) if "cross" in blocks else masked
+    return blocks.assign(
+        mean=blocks["mean"].where(usable),
+        power=blocks["power"].where(usable),
+        cross=cross_without(blocks, anomalous),
+    )

@@ -136,7 +136,7 @@ def _zone_width(stuck: float, samples: Array, away: Array, variance: float) -> f
 
 def has_empty_zone(blocks: xr.Dataset, axis: str) -> bool:
     """Return whether an axis shows no rates next to those at which it sticks near zero."""
-    return "zone_width" in blocks and bool(np.isfinite(blocks["zone_width"].sel(axis=axis)))
+    return bool(np.isfinite(blocks["zone_width"].sel(axis=axis)))
 
 
 def centre_of_range(blocks: xr.Dataset) -> float:

@@ -110,7 +110,6 @@ class Telegraph(BlockMeanStatistic):
                 *(
                     axis_values(searched, name, axis)
                     for name in ("samples", "sub_block_samples", "sub_block_mean")
-                    if name in searched
                 ),
             )
             evidence_nats[: axis_nats.size, row] = axis_nats

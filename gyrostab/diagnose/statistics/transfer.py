@@ -68,8 +68,7 @@ class Transfer(Statistic):
 
         Channels of no known effect, such as a seismometer, may see real motion without any other.
         """
-        usable = set(_reference_channels(blocks))
-        usable |= set(windows.axes) if "cross" in blocks else set()
+        usable = {*_reference_channels(blocks), *windows.axes}
         by_channel: dict[str, list[Variant]] = {}
         for values, prediction in predictions:
             for (parameter, channel), transfer in prediction.transfer.items():

@@ -233,8 +233,6 @@ def _coherence_factor(
     blocks: xr.Dataset, used: NDArray[np.bool_], members: list[NDArray[np.int64]], weight: Array
 ) -> Array:
     """Return the variance factor (record), 1, 1, group of the mean over coherent axes."""
-    if "cross" not in blocks:
-        return np.ones(1)
     first, second = pair_indices(blocks)
     power = np.nan_to_num(blocks["power"].values[..., used])
     cross = np.nan_to_num(blocks["cross"].values[..., used])

@@ -38,6 +38,7 @@ def frame(mean: np.ndarray) -> tuple[xr.Dataset, xr.Dataset]:
             "mean": (("record", "axis", "block"), mean[:, None]),
             "begin": ("block", begin),
             "end": ("block", begin + STEP),
+            "restart_end": ("restart", np.empty(0)),
         },
         {"axis": ["x"]},
         {"block_s": STEP},

@@ -291,8 +291,10 @@ def test_phase_locked_rates_are_detected(base):
 def test_transients_and_jumps_after_restarts_are_detected(base):
     blocks = records(base, 240, np.random.default_rng(10))
     assert find_statistic("restart").score(blocks, base) is None
-    blocks["restart_begin"] = ("restart", np.array([1000.0, 2400.0]))
-    blocks["restart_end"] = ("restart", np.array([1010.0, 2410.0]))
+    restarts = {"restart_begin": [1000.0, 2400.0], "restart_end": [1010.0, 2410.0]}
+    blocks = blocks.drop_dims("restart").assign(
+        {name: ("restart", times) for name, times in restarts.items()}
+    )
     z = find_statistic("restart").score(blocks, base)["z"].values
     assert np.nanstd(z) == pytest.approx(1.0, abs=0.06)
     since = np.where(
