@@ -71,7 +71,6 @@ class NullScores:
     statistics: Mapping[str, StatisticNull]
     #: Law of the largest ``-log p`` over the statistics, with p of each one's largest score.
     family: MaximumDistribution
-    records: int
 
     def p_value(self, statistic: str, z: Array | float) -> Array:
         """Return the probability that a null record is as extreme in any statistic as `z` here."""
@@ -89,9 +88,7 @@ def null_scores(
 ) -> NullScores:
     """Collect the scores of null records chunk by chunk, keeping only extreme scores."""
     gathered: dict[str, _ScoreSums] = {}
-    records = 0
     for chunk in nulls:
-        records += chunk.sizes["record"]
         powers = max(chunk["power"].size, chunk["line_power"].size) // chunk.sizes["record"]
         size = max(_MIN_RECORDS_AT_ONCE, _POWERS_AT_ONCE // powers)
         for first in range(0, chunk.sizes["record"], size):
@@ -114,7 +111,7 @@ def null_scores(
     family = _fit_maximum(
         np.max(list(largest.values()), axis=0), settings.tail_share, _MIN_TAIL_SCALE
     )
-    return NullScores(statistics, family, records)
+    return NullScores(statistics, family)
 
 
 def standardise(scores: xr.Dataset, null: StatisticNull) -> Array:

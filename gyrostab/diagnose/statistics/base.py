@@ -27,7 +27,7 @@ from gyrostab.diagnose.predict.sizes import linear_mixture
 from gyrostab.diagnose.predict.windows import distinct_variants, weigh_by_time
 from gyrostab.diagnose.settings import Settings
 from gyrostab.physics.base import Effect
-from gyrostab.physics.prediction import Prediction, Windows
+from gyrostab.physics.prediction import Windows
 
 Array = NDArray[Any]
 Sizes = Mapping[str, tuple[float, ...]]
@@ -143,18 +143,13 @@ class Statistic:
         self,
         kind: type[Effect],
         driver: tuple[str, ...],
-        predictions: Sequence[tuple[dict[str, Any], Prediction]],
+        prospects: Sequence[Prospect],
         windows: Windows,
         blocks: xr.Dataset,
-        coefficient: xr.DataArray,
     ) -> list[Candidate]:
         """Return the candidates of an effect that follows these channels."""
         variants = distinct_variants(
-            [
-                variant
-                for values, prediction in predictions
-                for variant in self.design(Prospect(values, prediction, blocks, coefficient))
-            ]
+            [variant for case in prospects for variant in self.design(case)]
         )
         if not variants:
             return []
@@ -339,7 +334,10 @@ def _square_root(square: float, sd: float) -> tuple[float, float]:
     ) - value
 
 
-def column_choices(columns: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return each parameter alone, and all together."""
-    single_columns: list[tuple[str, ...]] = [(name,) for name in columns]
-    return single_columns if len(single_columns) < 2 else [*single_columns, tuple(columns)]
+def choose_columns(
+    values: dict[str, Any], designs: Mapping[str, Array], *, squared: bool = False
+) -> Iterator[Variant]:
+    """Yield a variant with each parameter alone, and one with all together."""
+    for chosen in [*((name,) for name in designs), *([(*designs,)] if len(designs) > 1 else [])]:
+        design = np.stack([designs[name] for name in chosen])
+        yield Variant(values, chosen, design, squared=squared)

@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.sample_counts import hidden_by_grid
-from gyrostab.diagnose.predict.candidates import TIME_PARAMETER, Candidate
+from gyrostab.diagnose.predict.candidates import TIME_PARAMETER, Candidate, Prospect
 from gyrostab.diagnose.predict.channel_use import MIN_BLOCK_SHARE, missing_channel_reason
 from gyrostab.diagnose.predict.filter_response import with_band_response
 from gyrostab.diagnose.predict.linear_model import with_correlated_powers
@@ -27,7 +27,7 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import Effect
-from gyrostab.physics.prediction import Prediction, Windows
+from gyrostab.physics.prediction import Windows
 from gyrostab.physics.registry import effects
 from gyrostab.units import HOUR
 
@@ -154,20 +154,17 @@ def _candidates_of_effect(
 ) -> tuple[list[Candidate], str]:
     """Build the candidates of an effect with its channels, by statistic; or say why not."""
     windows = make_windows(blocks, drivers)
-    predictions: list[tuple[dict[str, Any], Prediction]] = []
+    prospects: list[Prospect] = []
     is_missing = bool(kind.channels) and not drivers
     obstacle = missing_channel_reason(tuple(kind.channels), blocks) if is_missing else ""
     for values in [] if is_missing else list(_nuisance_grid(kind, windows)):
         try:
             effect = kind.example(**values)
             in_windows = with_correlated_powers(predict_exogenous(effect, windows), blocks)
-            prediction = with_band_response(in_windows, effect, blocks)
-            predictions.append(
-                (
-                    values,
-                    _drop_hidden_means(kind.name, prediction, blocks, coefficient, settings),
-                )
+            case = Prospect(
+                values, with_band_response(in_windows, effect, blocks), blocks, coefficient
             )
+            prospects.append(_drop_hidden_means(kind.name, case, settings))
         except KeyError as error:
             obstacle = missing_channel_reason((str(error.args[0]),), blocks)
         except OptionError as error:
@@ -182,9 +179,7 @@ def _candidates_of_effect(
     built = [
         candidate
         for statistic in STATISTICS
-        for candidate in statistic.candidates(
-            kind, driver, predictions, windows, blocks, coefficient
-        )
+        for candidate in statistic.candidates(kind, driver, prospects, windows, blocks)
     ]
     return built, obstacle
 
@@ -218,27 +213,22 @@ def largest_size(effect: str, settings: Settings) -> float:
     }.get(effect, math.inf)
 
 
-def _drop_hidden_means(
-    name: str,
-    prediction: Prediction,
-    blocks: xr.Dataset,
-    coefficient: xr.DataArray,
-    settings: Settings,
-) -> Prediction:
+def _drop_hidden_means(name: str, case: Prospect, settings: Settings) -> Prospect:
     """Drop predicted means that white noise hides on every axis even at the largest size.
 
     An axis at rest cannot leak into others: its noise, taken for motion, would only blur real
     motion.
     """
     largest = largest_size(name, settings)
-    if math.isinf(largest) or not prediction.mean:
-        return prediction
-    good = np.isfinite(blocks["mean"].values)
-    white = coefficient.sel(term="N").values * np.sqrt(HOUR / float(blocks.attrs["block_s"]))
+    if math.isinf(largest) or not case.prediction.mean:
+        return case
+    good = np.isfinite(case.blocks["mean"].values)
+    block_s = float(case.blocks.attrs["block_s"])
+    white = case.coefficient.sel(term="N").values * np.sqrt(HOUR / block_s)
     mean = {}
-    for column, design in prediction.mean.items():
+    for column, design in case.prediction.mean.items():
         rows = np.where(good, np.broadcast_to(np.atleast_2d(design), good.shape), np.nan)
         moved = np.sqrt(np.nansum((rows - np.nanmean(rows, axis=1, keepdims=True)) ** 2, axis=1))
         if (largest * moved > settings.clear_sigma * white).any():
             mean[column] = design
-    return replace(prediction, mean=mean)
+    return case._replace(prediction=replace(case.prediction, mean=mean))

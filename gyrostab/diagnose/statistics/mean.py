@@ -29,7 +29,7 @@ from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.predict.sizes import mean_mixture
 from gyrostab.diagnose.predict.windows import hat_functions, power_on_times
 from gyrostab.diagnose.settings import Settings
-from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, column_choices
+from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, choose_columns
 from gyrostab.diagnose.statistics.jump_forms import (
     jump_competitors,
     restart_competitors,
@@ -173,8 +173,7 @@ class Mean(BlockMeanStatistic):
                 initial=1e-300
             ):
                 columns[name] = design
-        for chosen in column_choices(list(columns)):
-            yield Variant(case.values, chosen, np.stack([columns[name] for name in chosen]))
+        yield from choose_columns(case.values, columns)
 
     def complete_candidate(
         self, candidate: Candidate, kind: type[Effect], windows: PredictionWindows

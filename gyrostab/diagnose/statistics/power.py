@@ -26,7 +26,7 @@ from gyrostab.diagnose.predict.linear_model import (
 )
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
-from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, column_choices
+from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, choose_columns
 from gyrostab.diagnose.statistics.power_forms import free_powers, parts_of_record, separate_filters
 from gyrostab.diagnose.statistics.scores import (
     Array,
@@ -122,9 +122,7 @@ class Power(Statistic):
                 for name, density in columns.items()
                 if np.abs(density).max(initial=0.0) > 0 and not _is_white_and_constant(density)
             }
-            for chosen in column_choices(list(densities)):
-                design = np.stack([densities[name] for name in chosen])
-                yield Variant(case.values, chosen, design, squared=squared)
+            yield from choose_columns(case.values, densities, squared=squared)
         response = case.prediction.response
         if response:  # on noise as it was logged, whose N contains the aliases
             change = _filter_change(response["N"], case.coefficient, frequency, rate)

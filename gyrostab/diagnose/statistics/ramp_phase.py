@@ -20,7 +20,7 @@ from gyrostab.diagnose.predict.linear_model import (
     variant_designs,
 )
 from gyrostab.diagnose.predict.sizes import component_mixture
-from gyrostab.diagnose.statistics.base import NullDraw, Statistic, column_choices
+from gyrostab.diagnose.statistics.base import NullDraw, Statistic, choose_columns
 from gyrostab.diagnose.statistics.rotation_order import score_orders, turns_per_second
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
@@ -114,8 +114,7 @@ class RampPhase(Statistic):
             for name, design in case.prediction.phase_locked.items()
             if np.isfinite(design).all() and np.ptp(design) > 0
         }
-        for chosen in column_choices(list(profiles)):
-            yield Variant(case.values, chosen, np.stack([profiles[name] for name in chosen]))
+        yield from choose_columns(case.values, profiles)
 
     def model(
         self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State

@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.held_out import LinearModel
-from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
 from gyrostab.diagnose.predict.condition import free_covariance
 from gyrostab.diagnose.predict.linear_model import (
     State,
@@ -30,7 +30,7 @@ from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.statistics.base import NullDraw, Statistic
 from gyrostab.diagnose.statistics.cross_spectrum import draw_coherency
 from gyrostab.physics.base import Effect
-from gyrostab.physics.prediction import Prediction, Windows
+from gyrostab.physics.prediction import Windows
 from gyrostab.physics.registry import effects
 
 Array = NDArray[Any]
@@ -59,10 +59,9 @@ class Transfer(Statistic):
         self,
         kind: type[Effect],
         driver: tuple[str, ...],
-        predictions: Sequence[tuple[dict[str, Any], Prediction]],
+        prospects: Sequence[Prospect],
         windows: Windows,
         blocks: xr.Dataset,
-        coefficient: xr.DataArray,
     ) -> list[Candidate]:
         """Return candidates of rates that follow another channel or axis at every frequency.
 
@@ -70,11 +69,11 @@ class Transfer(Statistic):
         """
         usable = {*_reference_channels(blocks), *windows.axes}
         by_channel: dict[str, list[Variant]] = {}
-        for values, prediction in predictions:
-            for (parameter, channel), transfer in prediction.transfer.items():
+        for case in prospects:
+            for (parameter, channel), transfer in case.prediction.transfer.items():
                 if channel in usable:
                     by_channel.setdefault(channel, []).append(
-                        Variant(values, (parameter,), np.asarray(transfer)[None])
+                        Variant(case.values, (parameter,), np.asarray(transfer)[None])
                     )
         is_without_channel = kind.name == "real_motion" and not driver
         if is_without_channel or (by_channel and kind.stage == "motion"):
