@@ -35,8 +35,7 @@ from gyrostab.diagnose.predict.linear_model import (
 )
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.statistics.base import Competitor, SizeFit, Sizes
-from gyrostab.diagnose.statistics.power import Power
-from gyrostab.diagnose.statistics.power_forms import parts_of_record
+from gyrostab.diagnose.statistics.power import Power, parts_of_record
 from gyrostab.diagnose.statistics.random_process import RandomProcess
 from gyrostab.noise import NORMAL_95
 
