@@ -14,13 +14,10 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.examination import Examination, nuisance_alternatives
 from gyrostab.diagnose.identify.selection import _select_all
+from gyrostab.diagnose.identify.withdrawal import excess_low_frequency_noise, variance_fluctuation
 from gyrostab.diagnose.predict.condition import refit_weights
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.statistics.left_structure import (
-    excess_low_frequency_noise,
-    variance_fluctuation,
-)
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import name_effects, nulls
 
