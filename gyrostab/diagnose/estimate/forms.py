@@ -80,11 +80,7 @@ def _select_texts(component: Component, state: State, texts: Mapping[str, str]) 
     """Return a component in its best variant with some texts; None if it has none."""
     if component.variant.texts == texts or not _has_forms(component):
         return component
-    variants = [
-        variant
-        for variant in component.candidate.variants
-        if variant.has_columns_of(component.variant) and variant.texts == texts
-    ]
+    variants = component.candidate.family(replace(component.variant, values=texts))
     if not variants:
         return None
     return replace(
@@ -193,12 +189,7 @@ def _single_term_variant(component: Component, state: State, name: str) -> Varia
     That of a component of several terms may lie between the points of the grid: two terms of one
     point together can take the form of a single one between two points.
     """
-    single = replace(component.variant, columns=(name,))
-    variants = [
-        variant
-        for variant in component.candidate.variants
-        if variant.has_columns_of(single) and variant.texts == component.variant.texts
-    ]
+    variants = component.candidate.family(replace(component.variant, columns=(name,)))
     if variants and len(component.variant.columns) > 1:
         grid = [
             Point(variant, component_mixture(component, state, variant)) for variant in variants

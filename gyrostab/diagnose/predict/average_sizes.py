@@ -171,11 +171,7 @@ def _variant_family(component: Component, candidates: Sequence[Candidate]) -> li
         ),
         component.candidate,
     )
-    return [
-        variant
-        for variant in candidate.variants
-        if variant.has_columns_of(component.variant) and variant.texts == component.variant.texts
-    ]
+    return candidate.family(component.variant)
 
 
 def plain_places(effect: str, family: Sequence[Variant]) -> list[int]:

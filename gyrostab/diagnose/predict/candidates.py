@@ -107,6 +107,14 @@ class Candidate:
             *(variant.design for variant in self.variants),
         )
 
+    def family(self, variant: Variant) -> list[Variant]:
+        """Return the variants with the columns and texts of a given one."""
+        return [
+            other
+            for other in self.variants
+            if other.has_columns_of(variant) and other.texts == variant.texts
+        ]
+
     @property
     def columns(self) -> set[str]:
         """Columns of all variants."""

@@ -67,19 +67,13 @@ def mean_mixture(
 
 
 def component_mixture(
-    component: Component,
-    state: State,
-    variant: Variant | None = None,
-    *,
-    variance: Array | None = None,
+    component: Component, state: State, variant: Variant | None = None
 ) -> Mixture:
     """Compute the sizes of a component's columns, in units of the parameters (or squares).
 
-    All effects of `state` are in the model. `variance` is that of `mean_mixture`.
+    All effects of `state` are in the model.
     """
-    return component.statistic.mixture(
-        component, state, variant or component.variant, variance=variance
-    )
+    return component.statistic.mixture(component, state, variant or component.variant)
 
 
 def linear_mixture(component: Component, state: State, variant: Variant) -> Mixture:

@@ -266,9 +266,7 @@ class Statistic:
 
     # ---------------------------------------------------------------------- sizes
 
-    def mixture(
-        self, component: Component, state: State, variant: Variant, *, variance: Array | None = None
-    ) -> Mixture:
+    def mixture(self, component: Component, state: State, variant: Variant) -> Mixture:
         """Compute the sizes of a component's columns; by default from the linear model."""
         return linear_mixture(component, state, variant)
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.predict.candidates import TIME_PARAMETER, Component, Variant
+from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture, mean_mixture
 from gyrostab.diagnose.reduce.schema import axis_values
@@ -130,9 +131,12 @@ def _event_course(state: State, span: tuple[int, int]) -> Array:
 
 def _evidence_in_scatter(component: Component, state: State) -> float:
     """Return the log Bayes factor of a jump in means that may be noisy for a while [nats]."""
-    variances = _possible_variances(component, state)
-    jump = [component_mixture(component, state, variance=variance) for variance in variances]
-    none = [mean_mixture(state, component.row[0], [], variance=variance) for variance in variances]
+    axis, variances = component.row[0], _possible_variances(component, state)
+    columns = mean_columns(component.variant, state.axes.index(axis))
+    jump, none = (
+        [mean_mixture(state, axis, with_or_without, variance=variance) for variance in variances]
+        for with_or_without in (columns, [])
+    )
     with_jump, without = (
         np.array([mixture.evidence for mixture in mixtures]) for mixtures in (jump, none)
     )

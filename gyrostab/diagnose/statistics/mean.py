@@ -94,12 +94,10 @@ class BlockMeanStatistic(Statistic):
         state = state.with_columns("mean", axis, columns)
         return replace(state, masked=state.masked | _moving_blocks(state, row, columns))
 
-    def mixture(
-        self, component: Component, state: State, variant: Variant, *, variance: Array | None = None
-    ) -> Mixture:
+    def mixture(self, component: Component, state: State, variant: Variant) -> Mixture:
         """Compute sizes over the grid of random walk and flicker."""
         columns = mean_columns(variant, state.axes.index(component.row[0]))
-        return mean_mixture(state, component.row[0], columns, variance=variance)
+        return mean_mixture(state, component.row[0], columns)
 
     def can_explain(
         self, component: Component, region: Region, blocks: xr.Dataset, settings: Settings
