@@ -233,16 +233,9 @@ def _locate_mismatches(task: Task, named: NamedBlocks) -> tuple[list[Region], Nu
         conditioned_baseline,
         null,
         level=level,
-        settings=task.settings,
     )
     unexpected = drop_expected(
-        mismatches,
-        expected,
-        blocks,
-        conditioned_baseline,
-        null,
-        level=level,
-        settings=task.settings,
+        mismatches, expected, blocks, conditioned_baseline, null, level=level
     )
     return unexpected, null
 
@@ -285,7 +278,9 @@ def _leave_motion_out_of_lines(task: Task, named: NamedBlocks) -> NamedBlocks | 
         return None
     blocks, baseline = take_lines_at_rest(task, named.blocks, moving), named.baseline
     blocks_without_lines, records = _without_lines(task, blocks, baseline)
-    examination = named.examination.with_blocks(blocks_without_lines)
+    # with the threshold of the null records so far
+    start = replace(named.examination.start, blocks=blocks_without_lines)
+    examination = replace(named.examination, start=start)
     identifications = settle_forms(identify_effects(examination), baseline)
     return NamedBlocks(blocks, baseline, records, examination, identifications)
 

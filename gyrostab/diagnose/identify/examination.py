@@ -59,13 +59,6 @@ class Examination:
         """Numbers that decide what is named."""
         return self.start.settings
 
-    def with_blocks(self, blocks: xr.Dataset) -> Examination:
-        """Return the examination of the record with other line spectra, before any effect.
-
-        The threshold is that of the null records so far.
-        """
-        return replace(self, start=replace(self.start, blocks=blocks))
-
     def state_with(
         self, selections: Sequence[Selection], *, without: Selection | None = None
     ) -> State:

@@ -35,7 +35,6 @@ def locate_mismatches(
     null: NullScores,
     *,
     level: float = 0.01,
-    settings: Settings = DEFAULTS,
 ) -> list[Region]:
     """Locate where a recording differs from the simulation by more than noise does.
 
@@ -67,8 +66,8 @@ def locate_mismatches(
     for statistic in STATISTICS:
         if statistic.name in null.statistics:
             prepared = statistic.prepare(blocks, baseline, regions)
-            regions += _locate_regions(statistic, prepared, baseline, null, level, settings)
-    return merge_regions(regions, settings=settings)[:MAX_MISMATCHES]
+            regions += _locate_regions(statistic, prepared, baseline, null, level)
+    return merge_regions(regions, settings=null.settings)[:MAX_MISMATCHES]
 
 
 def _locate_regions(
@@ -77,7 +76,6 @@ def _locate_regions(
     baseline: xr.Dataset,
     null: NullScores,
     level: float,
-    settings: Settings,
 ) -> list[Region]:
     """Locate the regions of one statistic, row by row.
 
@@ -93,7 +91,7 @@ def _locate_regions(
         now, scores, row_z = baseline, first, z[row]
         remaining = row_z.copy()
         for _ in range(MAX_PER_ROW):
-            region = _take_region(statistic, scores, row, remaining, row_z, null, level, settings)
+            region = _take_region(statistic, scores, row, remaining, row_z, null, level)
             if region is None:
                 break
             regions.append(region)
@@ -106,7 +104,7 @@ def _locate_regions(
                 row_z = standardise(scores, null.statistics[statistic.name])[row]
                 remaining = row_z.copy()
     return (
-        merge_wandering_regions(regions, settings=settings)
+        merge_wandering_regions(regions, settings=null.settings)
         if statistic.is_linear_in_means
         else regions
     )
@@ -136,7 +134,6 @@ def _take_region(
     z: Array,
     null: NullScores,
     level: float,
-    settings: Settings,
 ) -> Region | None:
     """Return the region around the largest score left, or None; remove it from `remaining`."""
     critical = null.critical(statistic.name, level)
@@ -146,12 +143,12 @@ def _take_region(
     sign = 1.0 if remaining[window, column] > 0 else -1.0
     # explained windows do not count
     free = np.where(np.isfinite(remaining[:, column]) | np.isnan(z[:, column]), z[:, column], 0.0)
-    begin, end, fine = _find_span(scores, free * sign, int(window), settings)
+    begin, end, fine = _find_span(scores, free * sign, int(window), null.settings)
     combined, ratio = _combine_windows(scores, row, z * sign, fine, int(window))
     largest = abs(remaining[window, column])
     if np.isfinite(combined[column]):
         largest = max(largest, combined[column])
-    columns, reach = _find_columns(statistic, scores, combined, ratio, int(column), settings)
+    columns, reach = _find_columns(statistic, scores, combined, ratio, int(column), null.settings)
     region = {
         "statistic": statistic.name,
         "view": statistic.view,

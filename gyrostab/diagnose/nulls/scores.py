@@ -71,6 +71,7 @@ class NullScores:
     statistics: Mapping[str, StatisticNull]
     #: Law of the largest ``-log p`` over the statistics, with p of each one's largest score.
     family: MaximumDistribution
+    settings: Settings = DEFAULTS
 
     def p_value(self, statistic: str, z: Array | float) -> Array:
         """Return the probability that a null record is as extreme in any statistic as `z` here."""
@@ -111,7 +112,7 @@ def null_scores(
     family = _fit_maximum(
         np.max(list(largest.values()), axis=0), settings.tail_share, _MIN_TAIL_SCALE
     )
-    return NullScores(statistics, family)
+    return NullScores(statistics, family, settings)
 
 
 def standardise(scores: xr.Dataset, null: StatisticNull) -> Array:

@@ -105,7 +105,6 @@ def attribute_mismatches(
     level: float,
     without: Callable[[Sequence[Selection]], xr.Dataset] | None = None,
     still: xr.Dataset | None = None,
-    settings: Settings = DEFAULTS,
 ) -> list[list[str]]:
     """Find the effects that explain each mismatch.
 
@@ -128,18 +127,16 @@ def attribute_mismatches(
     still : xarray.Dataset, optional
         Line spectra of the recording without the blocks in which an effect moves the rate.
     """
+    settings = null.settings
 
     @cache
     def scores_without(out: tuple[Selection, ...]) -> Scores:
         remaining = [identification for identification in identified if identification not in out]
         baseline = without(out) if without is not None and out else after
-        return statistic_scores(
-            blocks, baseline, null, located, remaining, still=still, settings=settings
-        )
+        return statistic_scores(blocks, baseline, null, located, remaining, still=still)
 
     def score_without(region: Region, out: Sequence[Selection]) -> tuple[float, float]:
-        scores = scores_without(tuple(out))
-        return score_left(region, scores, null, level, settings.score_error_share)
+        return score_left(region, scores_without(tuple(out)), null, level)
 
     when = [_explained_spans(identification, blocks, settings) for identification in identified]
     moves = [
@@ -202,7 +199,6 @@ def drop_expected(
     null: NullScores,
     *,
     level: float,
-    settings: Settings = DEFAULTS,
 ) -> list[Region]:
     """Drop the mismatches that effects of the simulation itself explain.
 
@@ -221,15 +217,13 @@ def drop_expected(
         for identification in expected
         if any(
             component.statistic.is_count
-            and find_anomalous_blocks(component, blocks, settings).any()
+            and find_anomalous_blocks(component, blocks, null.settings).any()
             for component in identification.components
         )
     ]
     others = [identification for identification in expected if identification not in anomalous]
     by_count, by_all = (
-        attribute_mismatches(
-            located, identified, blocks, before, null, level=level, settings=settings
-        )
+        attribute_mismatches(located, identified, blocks, before, null, level=level)
         for identified in (anomalous, others)
     )
     return [

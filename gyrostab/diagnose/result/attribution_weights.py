@@ -31,7 +31,6 @@ def statistic_scores(
     identified: Sequence[Selection],
     *,
     still: xr.Dataset | None = None,
-    settings: Settings = DEFAULTS,
 ) -> Scores:
     """Score the recording against a baseline with effects.
 
@@ -40,6 +39,7 @@ def statistic_scores(
     lines of `still`, by default those of `blocks`.
     """
     out = []
+    settings = null.settings
     blocks = remove_known_motion(blocks, after, settings=settings)
     after = _with_shared_lines(blocks, after, identified)
     masked = mask_anomalous_blocks(blocks, components_of(identified), settings)
@@ -98,11 +98,11 @@ def _with_shared_lines(
 
 
 def score_left(
-    region: Region, scores: Scores, null: NullScores, level: float, error_share: float
+    region: Region, scores: Scores, null: NullScores, level: float
 ) -> tuple[float, float]:
     """Return the largest score left at a mismatch, and the score that still makes it one.
 
-    An error of the form of an effect may leave `error_share` of the score of the mismatch.
+    An error of the form of an effect may leave a share of the score of the mismatch.
     """
     largest_score, limit = 0.0, np.inf
     for name, statistic, z in scores:
@@ -126,7 +126,7 @@ def score_left(
         cells = np.abs(z[np.ix_(rows, inside, columns)])
         if np.isfinite(cells).any():
             largest_score = max(largest_score, float(np.nanmax(cells)))
-            allowed = error_share * abs(float(region["z"]))
+            allowed = null.settings.score_error_share * abs(float(region["z"]))
             limit = min(limit, max(null.critical(name, level), allowed))
     return largest_score, limit
 

@@ -177,7 +177,6 @@ def _attributed_mismatches(
         level=task.level / 2.0,
         without=without,
         still=lines,
-        settings=task.settings,
     )
     return mismatch_tables(located, explained, fit.identifications, blocks)
 

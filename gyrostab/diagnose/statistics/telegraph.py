@@ -183,29 +183,24 @@ class Telegraph(BlockMeanStatistic):
 def _search_axis(
     data: xr.Dataset, state: State, axis: str
 ) -> tuple[Array, TelegraphCourses, SwitchingEvidence | None, bool]:
-    """Search an axis for two levels in block means, and then within blocks."""
+    """Search an axis for two levels in block means, and then within blocks.
+
+    The switching within blocks is None unless it is better; the last result is whether it refutes
+    that in block means.
+    """
     evidence_nats, course = search_block_means(state, axis, data)
-    within, refuted = _search_fast_switching(data, state, axis, course, float(evidence_nats[0]))
-    return evidence_nats, course, within, refuted
-
-
-def _search_fast_switching(
-    data: xr.Dataset, state: State, axis: str, course: TelegraphCourses, evidence_nats: float
-) -> tuple[SwitchingEvidence | None, bool]:
-    """Find switching within blocks, if better than in block means; and whether it refutes it."""
     switching, block = _search_sub_blocks(data, state, axis), float(state.blocks.attrs["block_s"])
     if switching is None:
-        return None, False
+        return evidence_nats, course, None, False
     if not _is_resolved(switching, state):
-        return None, switching.refuted and float(
-            course.times[0].min()
-        ) < state.settings.refuted_blocks
+        is_short = float(course.times[0].min()) < state.settings.refuted_blocks
+        return evidence_nats, course, None, switching.refuted and is_short
     deviation = float(np.sqrt(np.nanmedian(axis_values(state.baseline, "mean_variance", axis))))
     # in block means the share of a block on a level is known to half of one of its parts
     error = float(course.step[0]) / (2.0 * PARTS_PER_BLOCK)
-    coarse = np.isfinite(evidence_nats) and error < state.settings.visible_sigma * deviation
+    coarse = np.isfinite(evidence_nats[0]) and error < state.settings.visible_sigma * deviation
     is_slow = switching.times.min() > state.settings.fast_blocks * block
-    return (None if coarse and is_slow else switching), False
+    return evidence_nats, course, None if coarse and is_slow else switching, False
 
 
 def _with_free_levels(evidence: CandidateEvidence, trial: Trial) -> CandidateEvidence:
