@@ -203,11 +203,8 @@ def take_lines_at_rest(task: Task, blocks: xr.Dataset, moving: NDArray[np.bool_]
 
     A step within a block has a broad spectrum, and all blocks in a part of the record share one
     line spectrum. The log is read again when a block has to be left out. An axis that moves has no
-    sines: they are sought in the record as a whole, where its levels have harmonics.
-
-    Parameters
-    ----------
-    moving : ndarray of bool, shape (axis, block)
+    sines: they are sought in the record as a whole, where its levels have harmonics. `moving` is by
+    (axis, block).
     """
     has_data = np.isfinite(blocks["power"].values).any(axis=-1)
     if not (moving & has_data).any():

@@ -29,19 +29,9 @@ def constant_rates(
     """Return the rate that a simulation adds on each axis to have the mean of the recording.
 
     Where values are rounded, clipped or stuck at zero depends on the constant rate, which the
-    comparison leaves free otherwise.
-
-    Parameters
-    ----------
-    effects : sequence of Effect
-        All of the model, with their sizes.
-    turning : str
-        Axis that feels the channel ``rotation_rate``, if any.
-
-    Returns
-    -------
-    dict of str to float
-        By axis [degree hour-1]; 0 without a block mean.
+    comparison leaves free otherwise. It is by axis [degree hour-1], and 0 without a block mean.
+    `effects` are all of the model, with their sizes; `turning` is the axis that feels the channel
+    ``rotation_rate``, if any.
     """
     axes = tuple(str(axis) for axis in blocks["axis"].values)
     rate = blocks["mean"].values.copy()

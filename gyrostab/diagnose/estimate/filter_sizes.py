@@ -47,13 +47,8 @@ def fit_filter_sizes(
 ) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
     """Fit the cutoff or length of a filter to the powers of all its axes, with free noise.
 
-    Returns
-    -------
-    sizes : dict of str to (float, float) or (float, float, float, float)
-        The parameter that is measured with its standard error, and with the ends of its 95 %
-        interval where several places of the grid fit.
-    other_values : dict of str to float
-        Order, and how the samples are made.
+    The parameter that is measured has its standard error, and the ends of its 95 % interval where
+    several places of the grid fit. The other values are the order, and how the samples are made.
     """
     kind = effects()[components[0].candidate.effect]
     fits = [_average_powers(component.row[0], state) for component in components]
@@ -153,13 +148,8 @@ def _widen_interval(
     With free noise that rises with frequency, a low-pass at a low cutoff does what a weak one at a
     high cutoff does. Other orders, and samples that are picked, have other cutoffs.
 
-    Parameters
-    ----------
-    refined : (float, float)
-        Mean and standard deviation about the best place.
-    tried : sequence of (float, float)
-        Values of all filters of the family, evenly spread in their logarithm, and their log
-        likelihoods.
+    `refined` has mean and standard deviation about the best place, `tried` the values of all
+    filters of the family, evenly spread in their logarithm, and their log likelihoods.
     """
     value, log = (np.array(column) for column in zip(*sorted(tried), strict=True))
     share = np.exp(log - np.logaddexp.reduce(log))

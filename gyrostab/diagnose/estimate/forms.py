@@ -112,21 +112,10 @@ def _has_forms(component: Component) -> bool:
 def prefer_plainer(component: Component, state: State) -> Component:
     """Return a component with a single term where that explains as much, and a note about it.
 
+    A component of neither means nor powers is returned as it is. The state has all other effects.
     A component of one term gets the first of those that explain as much, but for 3 nats and an
     error of the form. Terms that rise and fall together, as g^2 and g^4 at one level of vibration,
     would otherwise get large and opposite sizes that are both wrong.
-
-    Parameters
-    ----------
-    component : Component
-        Of means or powers; any other is returned as it is.
-    state : State
-        With all other effects in the model.
-
-    Returns
-    -------
-    Component
-        Unchanged, or with a sentence about it as its `note`.
     """
     if not (component.statistic.is_linear_in_means or component.statistic.is_power):
         return component

@@ -83,11 +83,8 @@ class Fitted:
 def fit_identifications(identifications: Identifications, baseline: xr.Dataset) -> list[Fitted]:
     """Fit all identified effects, each with the others in the model.
 
-    Returns
-    -------
-    list of Fitted
-        One entry per axis of an effect with a single size for all of its axes; one entry for all
-        axes where each has its own size, or where it changes samples at the same instants.
+    An effect with a single size for all of its axes has one entry per axis. It has one for all axes
+    where each has its own size, or where it changes samples at the same instants.
     """
     return [
         fitted

@@ -73,19 +73,9 @@ def recalibrate(
     from noise, so that the whole record is used; with something unidentified on the axis, only its
     quiescent blocks are.
 
-    Parameters
-    ----------
-    baseline : xarray.Dataset
-        The baseline that the identification started from; returned as it is unless it was
-        calibrated on the recording.
-    known : ndarray of bool, shape (block,), optional
-        Blocks that may be used; all by default.
-
-    Returns
-    -------
-    xarray.Dataset
-        As from `gyrostab.diagnose.baseline.calibrate.calibrate_noise`, with the steady random
-        processes of the effects in the means; ``attrs["recalibrated"]`` lists the axes.
+    The baseline that the identification started from is returned as it is unless it was calibrated
+    on the recording. The new one has the steady random processes of the effects in the means;
+    ``attrs["recalibrated"]`` lists its axes. Only blocks `known` (block,) are used, by default all.
     """
     if baseline.attrs.get("source") != "calibrated" or not identifications.identified:
         return baseline
@@ -147,13 +137,9 @@ _AXIS_VARIABLES = (
 def remove_fast_switching(identifications: Identifications, baseline: xr.Dataset) -> xr.Dataset:
     """Calibrate the noise with only those biases in the model that switch within blocks.
 
-    With their power taken for noise, nothing can be compared with the baseline.
-
-    Parameters
-    ----------
-    baseline : xarray.Dataset
-        The baseline that the identification started from; returned as it is unless it was
-        calibrated on the recording and such a bias is identified.
+    With their power taken for noise, nothing can be compared with the baseline. The baseline that
+    the identification started from is returned as it is unless it was calibrated on the recording
+    and such a bias is identified.
     """
     switching = tuple(
         identification

@@ -27,22 +27,14 @@ Array = NDArray[np.float64]
 def unexplained_motion(
     blocks: xr.Dataset, identified: Iterable[Selection], state: State
 ) -> NDArray[np.bool_]:
-    """Find the moving blocks of axes without an effect that explains the motion.
+    """Find the moving blocks (axis, block) of axes without an effect that explains the motion.
 
     An effect must leave next to nothing of the motion, in the means or, where it follows a channel
     sample by sample, in the power. It is not enough that it adds evidence: a step or a drifting
     channel also explains a part of an intermittent rotation. Two levels, or several steps, have
     their course from the means themselves, hence no error of form: they must leave the axis at
-    rest. Outliers explain the blocks in which they are.
-
-    Parameters
-    ----------
-    state : State
-        Without any effect, weighted with all of them.
-
-    Returns
-    -------
-    ndarray of bool, shape (axis, block)
+    rest. Outliers explain the blocks in which they are. The state is that without any effect,
+    weighted with all of them.
     """
     components, settings = components_of(identified), state.settings
     explained_axes = {

@@ -25,11 +25,8 @@ MAX_VARIANTS = 9  # evenly spread over the grid of a mean: enough for a smooth m
 def find_upper_limits(identifications: Identifications) -> dict[str, dict[str, Any]]:
     """Find how large each effect may be that was not identified.
 
-    Returns
-    -------
-    dict of str to dict
-        ``upper_limit``, 95 %, of the effect's first size in means, powers or cross-spectra, the
-        largest over the axes; NaN where the record has none. Its ``unit``, and the ``reason``.
+    The ``upper_limit``, 95 %, is that of the effect's first size in means, powers or cross-spectra,
+    the largest over the axes; NaN where the record has none, with its ``unit`` and the ``reason``.
     """
     named = {
         identification.effect

@@ -297,19 +297,9 @@ def switching_powers(share: Array, low: float, high: float, size: int, rate: flo
     """Compute the band powers within blocks of a bias of two levels, for a step of one.
 
     Frequencies that sub-blocks resolve have the power of the course; higher ones that of switches
-    at random times, as many as in each block.
-
-    Parameters
-    ----------
-    share : ndarray, shape (block, sub_block)
-        Share of each sub-block on the upper level.
-    low, high : float
-        Mean times on both levels [s].
-
-    Returns
-    -------
-    ndarray, shape (block, band)
-        Two-sided density [Hz-1].
+    at random times, as many as in each block. The share is that of each sub-block (block,
+    sub_block) on the upper level; `low` and `high` are the mean times on both levels [s]. The
+    result is the two-sided density (block, band) [Hz-1].
 
     Examples
     --------

@@ -69,12 +69,8 @@ class Mixture:
 def products_mixture(products: Products, log_weight: Array, *, ridge: float = 1e-9) -> Mixture:
     """Return the sizes of free columns at each point of a grid, from the products of one record.
 
-    Parameters
-    ----------
-    log_weight : ndarray, shape (point,)
-        Prior of the grid, as logarithms.
-    ridge : float
-        Share of the trace of the Gram matrix on its diagonal, against singular columns.
+    `log_weight` (point,) is the log prior of the grid, `ridge` the share of the trace of the Gram
+    matrix on its diagonal, against singular columns.
     """
     cross = products.cross[:, :, 0]
     trace = np.trace(products.gram, axis1=1, axis2=2)[:, None, None]

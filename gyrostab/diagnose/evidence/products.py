@@ -185,16 +185,9 @@ def remove_common_part(
     weight`` on the diagonal, plus ``common`` times the product of the units everywhere. Products of
     columns that were transformed here are those of that covariance.
 
-    Parameters
-    ----------
-    values : ndarray, shape (block, cell, column)
-        Data or designs.
-    weight : ndarray, shape (block, cell)
-        One over the variance that is not common; 0 for no data.
-    common : ndarray, shape (block,)
-        Variance of the common part.
-    unit : ndarray, shape (block, cell), optional
-        Size of the common part in each cell, 1 by default.
+    The values (block, cell, column) are data or designs. The weight (block, cell) is one over the
+    variance that is not common, 0 for no data; `common` (block,) is the variance of the common
+    part, and `unit` (block, cell) its size in each cell, 1 by default.
 
     Examples
     --------
@@ -223,16 +216,9 @@ def log_evidence(
 ) -> Array:
     """Compute the log marginal likelihood without any design, and with each, (1 + design, record).
 
-    Parameters
-    ----------
-    designs : sequence of ndarray
-        Indices of the columns of each design.
-    limits : ndarray, shape (column,)
-        Error of every factor in white noise; 0 for columns without effect.
-    log_weight : ndarray, shape (grid,)
-        Logarithm of the weight of every grid point; not normalised.
-    is_bounded : sequence of bool, shape (design,), optional
-        Whether the factors of a design cannot be negative; none by default.
+    A design is the indices of its columns, and may have factors that cannot be negative. The limits
+    (column,) are the errors of the factors in white noise, 0 for columns without effect. The log
+    weights of the grid points (grid,) are not normalised.
     """
     bounded = np.array(is_bounded, np.bool_) if len(is_bounded) else np.zeros(len(designs), bool)
     weight = log_weight - np.logaddexp.reduce(log_weight)
@@ -288,12 +274,8 @@ def _bounded_evidence(base: Array, rotated: Array, eigenvalues: Array, vectors: 
     Their prior is the positive half of the normal one. The likelihood changes by the share of the
     posterior that is positive over that of the prior, each as if the factors were independent.
 
-    Parameters
-    ----------
-    base : ndarray, shape (record, grid)
-    rotated : ndarray, shape (grid, design, column, record)
-        ``x' y`` in the frame of the eigenvectors of ``x' x``.
-    eigenvalues, vectors : ndarray, shape (grid, design, column) and (grid, design, column, column)
+    `rotated` (grid, design, column, record) is ``x' y`` in the frame of the eigenvectors of ``x'
+    x``, whose eigenvalues are (grid, design, column); `base` is (record, grid).
     """
     width = np.square(WIDTHS)[:, None, None, None]
     spread = 1.0 + width * eigenvalues

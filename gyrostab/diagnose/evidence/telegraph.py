@@ -70,20 +70,10 @@ def telegraph_courses(
 ) -> TelegraphCourses:
     """Fit biases of two levels in white noise, by expectation-maximisation from several starts.
 
-    Parameters
-    ----------
-    values : ndarray, shape (block, record)
-        Block means [degree hour-1], of which those `present` are used.
-    variance : ndarray, shape (block,)
-        White variance of the means, a lower limit of the scatter.
-    columns_given : ndarray, shape (block, column)
-        Columns of free size, the first one constant.
-    starts : sequence of (float, float)
-        Quantiles of the means that start the levels.
-    min_scatter : float
-        Lowest scatter over the white variance.
-    parts : int
-        Parts of a block, at least `PARTS_PER_BLOCK`.
+    Only the block means (block, record) [degree hour-1] that are `present` count. `min_scatter` is
+    the lowest scatter over their white variance (block,). The given columns (block, column) have
+    free sizes; the first one is constant. The levels start at quantiles of the means. A block has
+    so many parts, at least `PARTS_PER_BLOCK`.
 
     Examples
     --------

@@ -104,19 +104,10 @@ def prepare_examination(
 ) -> Examination:
     """Collect the candidates for a recording, and the threshold that null records give.
 
-    Parameters
-    ----------
-    nulls : iterable of xarray.Dataset
-        Null records, several at a time with a leading dimension ``record``.
-    level : float
-        Probability that noise alone gives an identification, or something unidentified.
-    seed : int
-        Seed of the draws for statistics that the null records do not contain.
-    known : sequence of Effect
-        Effects that the simulation contains but not the baseline. They are in the model before
-        the selection begins.
-    progress : Stage
-        Callback with the number of null records done.
+    The null records come several at a time, with a leading dimension ``record``. With the
+    probability `level`, noise alone gives an identification, or something unidentified. `seed` is
+    that of the draws for statistics that the null records do not contain. The simulation contains
+    the `known` effects, but not the baseline; they are in the model before the selection begins.
     """
     folds = fold_blocks(blocks)
     effects, reasons = effect_candidates(blocks, baseline["coefficient"], settings=settings)

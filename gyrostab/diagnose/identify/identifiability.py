@@ -38,16 +38,8 @@ def keep_physical(
 
     Without an effect on an axis, chance may fit an impossible size. If no component is left, the
     second result is the form that excludes the effect, and by how much it explains more [nats], NaN
-    for sizes that physics excludes.
-
-    Parameters
-    ----------
-    components : sequence of Component
-        Components of the effect, the strongest first.
-    state : State
-        With all other effects in the model.
-    error : float
-        What errors of the form of all other effects may leave to this one [nats].
+    for sizes that physics excludes. The state has all other effects in the model; `error` is what
+    errors of their form may leave to this one [nats].
     """
     by_statistic = {
         statistic: [component for component in components if component.statistic is statistic]
@@ -315,23 +307,10 @@ def passes_time_shift_test(
 ) -> tuple[bool, float, float]:
     """Test whether an effect explains more than time-shifted surrogates of its channel.
 
-    Parameters
-    ----------
-    components : sequence of Component
-        Components of the effect.
-    state : State
-        What is in the model without it.
+    The state is that without the effect. It passes where no surrogate can be made. The other
+    results are the share of the channel and its surrogates that explain as much as the channel, and
+    by how much the best surrogate explains more [nats]; NaN where too few of them differ from it.
 
-    Returns
-    -------
-    passed : bool
-        Also true where no surrogate can be made.
-    p_value, nats : float
-        Share of the channel and its surrogates that explain as much as the channel, and by how much
-        the best surrogate explains more [nats]; NaN where too few of them differ from the channel.
-
-    Notes
-    -----
     All shifts round the record are equally likely for a channel that has nothing to do with the
     rate. Those near the recorded time therefore count, although they resemble the channel: without
     them, a smooth channel passes whenever it is near the best time. Copies from elsewhere do not

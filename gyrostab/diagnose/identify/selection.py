@@ -83,14 +83,9 @@ def _select_all(
 ) -> tuple[list[Selection], dict[str, tuple[str, float]]]:
     """Select the best candidate, put it into the model, and repeat while one passes.
 
-    What wanders without a course comes last, once no other effect passes.
-
-    Returns
-    -------
-    chosen : list of Selection
-    beaten : dict of str to (str, float)
-        Key of each candidate that passed the threshold and was not selected -> another form or a
-        time-shifted channel, and by how much it explained more [nats].
+    What wanders without a course comes last, once no other effect passes. The second result has the
+    key of each candidate that passed the threshold and was not selected -> another form or a
+    time-shifted channel, and by how much it explained more [nats].
     """
     chosen: list[Selection] = []
     state = examination.start

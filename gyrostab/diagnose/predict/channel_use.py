@@ -43,19 +43,9 @@ def missing_channel_reason(channels: Collection[str], blocks: xr.Dataset) -> str
 
 
 def unused_channels(blocks: xr.Dataset, used: Iterable[str]) -> list[dict[str, str]]:
-    """List the channels that took no part in a diagnosis.
+    """List the channels that no candidate used in a diagnosis, each with ``name`` and ``reason``.
 
-    Parameters
-    ----------
-    blocks : xarray.Dataset
-        From `reduce_log`; its attribute ``unused_channels`` has those left out before.
-    used : iterable of str
-        Channels that a candidate uses.
-
-    Returns
-    -------
-    list of dict
-        ``name`` and ``reason``.
+    The attribute ``unused_channels`` of the blocks has those left out before.
     """
     reasons = dict(blocks.attrs.get("unused_channels", {}))
     used_channels = set(used)

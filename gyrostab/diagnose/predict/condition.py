@@ -105,12 +105,8 @@ def drop_changed_tails(
     """Drop kurtosis and outliers that a changing noise level explains.
 
     Two levels in one block have tails that neither level has. Another noise level has another
-    kurtosis, because higher noise hides that of rounding.
-
-    Parameters
-    ----------
-    expected : ndarray, shape (axis, block, band)
-        Expected power.
+    kurtosis, because higher noise hides that of rounding. `expected` is the power by (axis, block,
+    band).
     """
     level = np.log(expected @ (blocks["band_high"].values - blocks["band_low"].values))
     step = np.abs(np.diff(level, axis=1)) > settings.max_level_step

@@ -88,14 +88,8 @@ def undo_filter(
     """Undo a filter in the line spectrum of an axis, once only; return the lines that it stops.
 
     A filter is named by the shape of its response, at any size: a weak one is undone by as much as
-    the spectrum requires.
-
-    Parameters
-    ----------
-    values : mapping
-        Parameters of the filter at its full size.
-    expected : ndarray, shape (line,)
-        Density without the filter, up to a factor.
+    the spectrum requires. `values` are its parameters at its full size, `expected` (line,) is the
+    density without it, up to a factor.
     """
     frequency = blocks["line_frequency"].values
     full = filter_factors(effects()[effect].example(**values), blocks, frequency)["N"]

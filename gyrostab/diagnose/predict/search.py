@@ -55,16 +55,10 @@ def compute_evidence(
     count_evidence: CountEvidence | None = None,
     rng: np.random.Generator | None = None,
 ) -> list[CandidateEvidence]:
-    """Compute the evidence of candidates on data.
+    """Compute the evidence of candidates on the recording, or on null records.
 
-    Parameters
-    ----------
-    data : xarray.Dataset
-        The recording, or null records.
-    count_evidence : CountEvidence, optional
-        Without it, sample counts are left out.
-    rng : numpy.random.Generator, optional
-        For null records: generator of the statistics they do not have.
+    Without `count_evidence`, sample counts are left out. `rng` generates the statistics that null
+    records do not have.
     """
     trial = Trial(data, state, folds, count_evidence, rng)
     groups: dict[tuple[object, ...], list[Candidate]] = {}

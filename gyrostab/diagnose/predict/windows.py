@@ -47,10 +47,7 @@ def channel_units(blocks: xr.Dataset) -> dict[str, str]:
 def make_windows(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
     """Return the record in the form that effects take for their predictions.
 
-    Parameters
-    ----------
-    drivers : mapping of str to str
-        Channels of the log by channel of the effect.
+    `drivers` has the channels of the log by channel of the effect.
     """
     axes = tuple(str(axis) for axis in blocks["axis"].values)
     means = dict(zip(axes, map(fill_linearly, measured(blocks, "mean").values), strict=True))
@@ -235,16 +232,11 @@ def power_on_times(windows: Windows) -> Array:
 
 
 def select_step_times(values: Array, windows: Windows) -> list[float]:
-    """Select the times to try among the possible ones.
+    """Select the times to try among the possible ones, which rise [s].
 
     All if they are few. Otherwise some at equal intervals, those at which power came back, and
     those at which the means of an axis step most. Each has the prior probability of the time it
     represents, so that selecting by the means gives no advantage.
-
-    Parameters
-    ----------
-    values : ndarray
-        Possible times, rising [s].
 
     Examples
     --------

@@ -242,11 +242,7 @@ class Accumulator:
         """Return band powers of waves at the harmonics of the rotation, and add line spectra.
 
         The waves have an amplitude of 1 and any phase, and are sampled where an axis is: an uneven
-        rotation or gaps spread them over many bands.
-
-        Returns
-        -------
-        ndarray, shape (harmonic, block, band)
+        rotation or gaps spread them over many bands. The shape is (harmonic, block, band).
         """
         used = np.count_nonzero(present, axis=-1) >= self.min_samples
         place, table, _, _ = self._read_gaps(present, used)

@@ -31,11 +31,7 @@ _KEPT_STATISTICS = ("mean", "power", "cross")
 
 
 def moving_blocks(blocks: xr.Dataset, *, settings: Settings = DEFAULTS) -> NDArray[np.bool_]:
-    """Find the blocks in which an axis moves far beyond its scatter at rest.
-
-    Returns
-    -------
-    ndarray of bool, shape (axis, block)
+    """Find the blocks (axis, block) in which an axis moves far beyond its scatter at rest.
 
     Examples
     --------
@@ -112,17 +108,9 @@ def without_motion(
     restart_gap: Any = 5.0,
     progress: Stage = no_stage,
 ) -> xr.Dataset:
-    """Reduce a log without the moving blocks of the axes that move.
+    """Reduce a log again, with options of `reduce_log`, without its moving blocks (axis, block).
 
-    What they measured stays in variables ``measured_<name>``.
-
-    Parameters
-    ----------
-    blocks : xarray.Dataset
-        The log, from `reduce_log`.
-    moving : ndarray of bool, shape (axis, block)
-    restart_gap, progress
-        As in `reduce_log`.
+    What these measured stays in variables ``measured_<name>``.
     """
     same = f"{blocks.attrs['block_samples']}samples"
     out = reduce_log(log, block=same, restart_gap=restart_gap, left_out=moving, progress=progress)

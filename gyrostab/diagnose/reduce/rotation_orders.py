@@ -125,16 +125,9 @@ def _fit_harmonics(
     amplitude is then larger than with an even rotation: 1.2 times with stick-slip of 0.6 once per
     turn, up to 1.4 times with 0.9.
 
-    Parameters
-    ----------
-    values : ndarray, shape (axis, block, sample)
-        Zero where samples are missing.
-    wheels : sequence of ndarray, shape (block, sample)
-        Each demodulates a harmonic.
-    enough : ndarray of bool, shape (axis, block)
-        Blocks to fit.
-    is_sampled : ndarray of bool, shape (block, harmonic)
-        Harmonics to fit.
+    The values (axis, block, sample) are zero where samples are missing. Each wheel (block, sample)
+    demodulates a harmonic. `enough` (axis, block) selects the blocks to fit, `is_sampled` (block,
+    harmonic) their harmonics.
     """
     basis = np.stack([part for wheel in wheels for part in (wheel.real, -wheel.imag)], axis=-1)
     amplitudes = np.full((*enough.shape, len(wheels)), np.nan + 0j)

@@ -115,17 +115,9 @@ def attribute_mismatches(
     causes the difference. In blocks within which an effect moves the rate, power and the lowest
     lines exceed the noise; the effect explains these too.
 
-    Parameters
-    ----------
-    located : sequence of Region
-        Mismatches from `gyrostab.diagnose.locate.mismatches.locate_mismatches`.
-    blocks, after : xarray.Dataset
-        The recording, and the baseline with the effects.
-    without : callable, optional
-        Returns the baseline with the effects except those given, at the sizes of the joint fit.
-        Without it, every effect at the place of a mismatch explains it.
-    still : xarray.Dataset, optional
-        Line spectra of the recording without the blocks in which an effect moves the rate.
+    `after` is the baseline with the effects, and `without` returns that except for those given, at
+    the sizes of the joint fit. Without it, every effect at the place of a mismatch explains it.
+    `still` has line spectra without the blocks in which an effect moves the rate.
     """
     settings = null.settings
 
@@ -202,13 +194,9 @@ def drop_expected(
 ) -> list[Region]:
     """Drop the mismatches that effects of the simulation itself explain.
 
-    Parameters
-    ----------
-    located : sequence of Region
-        Mismatches located with the expected anomalous samples left out. Effects with such samples
-        therefore explain mismatches of the sample distribution only.
-    blocks, before : xarray.Dataset
-        The recording, and the baseline with these effects.
+    They were located with the expected anomalous samples left out. Effects with such samples
+    therefore explain mismatches of the sample distribution only. `before` is the baseline with
+    these effects.
     """
     if not expected:
         return list(located)

@@ -147,15 +147,9 @@ def needed_effects(
     effect whose contribution the statistic does not contain stays, and so does the largest
     contributor.
 
-    Parameters
-    ----------
-    region : Region
-        The mismatch.
-    shown : sequence of (Selection, sequence of Component)
-        Effects that act there and together remove it, each with its components that can show in its
-        statistic.
-    left : callable
-        Takes effects to leave out; returns the score that is left, and the score of a mismatch.
+    Those `shown` act there and together remove it, each with its components that can show in its
+    statistic. `left` takes effects to leave out, and returns the score that is left, and the score
+    of a mismatch.
     """
     weighed = [
         identification

@@ -28,16 +28,8 @@ def find_families(
     Lines at multiples of a spacing, counted from zero or from another line, are a family if the
     probability is below 5 % that as many unrelated lines fall there, over all spacings and centres
     that are tried. The least probable family is taken first. More than three lines without a family
-    are one too.
-
-    Parameters
-    ----------
-    frequencies : sequence of float
-        [Hz]
-    resolution : float
-        Distance of two lines of the spectrum [Hz].
-    bandwidth : float
-        Half the sampling rate [Hz].
+    are one too. The resolution is the distance of two lines of the spectrum, the bandwidth half the
+    sampling rate [Hz].
 
     Examples
     --------

@@ -110,14 +110,8 @@ def fit_supported(
 ) -> tuple[Identifications, list[Fitted], Fit]:
     """Fit the effects, and drop those whose size may be zero, until none is left to drop.
 
-    Returns
-    -------
-    identifications : Identifications
-        Without the effects whose size may be zero.
-    first : list of Fitted
-        Sizes with the noise of `baseline`.
-    fit : Fit
-        Sizes with the noise that the effects leave.
+    Return the remaining effects, their sizes with the noise of `baseline`, and their sizes with the
+    noise that they leave.
     """
     while True:
         first = fit_identifications(identifications, baseline)
@@ -193,15 +187,8 @@ def _make_surfaces_with_outliers(
 def supported_axes(fitted: Fitted) -> tuple[str, ...]:
     """Find the axes on which a size of the effect differs from zero.
 
-    Parameters
-    ----------
-    fitted : Fitted
-        Effect with its sizes. A parameter ``name.axis`` belongs to one axis, any other to all.
-
-    Returns
-    -------
-    tuple of str
-        All axes when no size is measured, as for motion with another form in every band.
+    A parameter ``name.axis`` belongs to one axis, any other to all. Without a measured size, as for
+    motion with another form in every band, all axes are returned.
     """
     sizes = effects()[fitted.identification.effect].size_parameters
     measured = {
@@ -226,12 +213,8 @@ def keep_supported(
     """Keep the effects whose size differs from zero, on the axes where it does.
 
     What an effect gained on the other axes becomes unidentified if that exceeds its threshold:
-    something is there, but the record does not show that this effect caused it.
-
-    Returns
-    -------
-    Identifications
-        `identifications` itself when every effect keeps all of its axes.
+    something is there, but the record does not show that this effect caused it. If every effect
+    keeps all of its axes, `identifications` itself is returned.
     """
     identified: list[Selection] = []
     unknown: list[Selection] = []

@@ -184,12 +184,7 @@ def model_tables(
 ) -> dict[str, Any]:
     """Return the tables of the model with the effects added.
 
-    Parameters
-    ----------
-    own : Model or None
-        The model that was given.
-    turning : str
-        Axis that feels the channel ``rotation_rate``, if any.
+    `own` is the model that was given, `turning` the axis that feels the channel ``rotation_rate``.
     """
     noise = {
         str(axis): {

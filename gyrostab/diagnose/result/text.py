@@ -91,10 +91,7 @@ def span_text(begin: float, end: float, whole: float) -> str:
 def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
     """Write one sentence on a place where recording and simulation differ.
 
-    Parameters
-    ----------
-    region : mapping
-        Fields of `gyrostab.diagnose.locate.mismatches.Region`, with ``axes`` as a list.
+    It is a `gyrostab.diagnose.locate.mismatches.Region` with ``axes`` as a list.
 
     Examples
     --------
@@ -113,14 +110,8 @@ def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
 def motion_statement(axis: str, when: str, largest: float, followers: Sequence[str]) -> str:
     """Write a sentence on an axis that moves far beyond its noise and that no channel explains.
 
-    Parameters
-    ----------
-    axis, when : str
-        Where and when; `when` from `span_text`.
-    largest : float
-        Largest deviation [deg/h].
-    followers : sequence of str
-        Axes that see the same motion through a misalignment.
+    `when` is from `span_text`, `largest` the largest deviation [deg/h]. The followers are axes that
+    see the same motion through a misalignment.
 
     Examples
     --------
@@ -204,14 +195,8 @@ def effect_statement(
 ) -> str:
     """Describe an effect, when it acts, and what the record cannot distinguish it from.
 
-    Parameters
-    ----------
-    description : str
-        What the effect does, with its numbers; from `Effect.say`.
-    alternatives : sequence of str
-        Names of the effects that look the same in this record.
-    intervals : sequence of str
-        When it acts, from `span_text`.
+    The description is from `Effect.say`, the intervals are from `span_text`, and the alternatives
+    are names of effects.
 
     Examples
     --------

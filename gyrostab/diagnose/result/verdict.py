@@ -112,15 +112,8 @@ def decide_verdict(
 ) -> str:
     """Choose one of `gyrostab.diagnose.result.content.VERDICTS`.
 
-    Parameters
-    ----------
-    mismatches : sequence
-    effects : sequence of mappings
-        With ``name``, ``probability`` and ``alternatives``.
-    unexplained : iterable of int
-        Numbers of the mismatches without an effect.
-    held : mapping
-        See `gyrostab.diagnose.result.content.HeldOut`.
+    Effects have ``name``, ``probability`` and ``alternatives``; `unexplained` are the numbers of
+    the mismatches without an effect, `held` is `gyrostab.diagnose.result.content.HeldOut`.
 
     Examples
     --------

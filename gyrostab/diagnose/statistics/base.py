@@ -216,12 +216,7 @@ class Statistic:
     ) -> Iterator[Competitor]:
         """Yield other forms of an effect with these components in the statistic, on all axes.
 
-        Parameters
-        ----------
-        state : State
-            With all other effects in the model.
-        error : float
-            What errors of the form of these may leave [nats].
+        The state has all other effects in the model; errors of their form may leave `error` [nats].
         """
         yield from ()
 

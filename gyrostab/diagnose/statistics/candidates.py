@@ -39,16 +39,8 @@ def effect_candidates(
 ) -> tuple[list[Candidate], dict[str, str]]:
     """Build the candidates of all registered effects that this record can show.
 
-    Parameters
-    ----------
-    coefficient : xarray.DataArray
-        ``(axis, term)``: noise of the baseline, in units of the noise model.
-
-    Returns
-    -------
-    candidates : list of Candidate
-    reasons : dict of str to str
-        Why an effect cannot be seen in this record.
+    The second result says why the others cannot be seen. The coefficients are the noise of the
+    baseline ``(axis, term)``, in units of the noise model.
 
     Examples
     --------

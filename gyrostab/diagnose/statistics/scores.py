@@ -135,21 +135,13 @@ def statistic_dataset(
     estimate: Array | None = None,
     one_sided: bool = False,
 ) -> xr.Dataset:
-    """Assemble ``z``, ``ratio`` and ``estimate`` of a statistic by (record), row, window, tau.
+    """Assemble the results of a statistic by (record), row, window, tau.
 
-    Parameters
-    ----------
-    columns : dict
-        ``what`` (str), ``tau_min_s``, ``tau_max_s`` [s] and ``frequency`` [Hz] of each column, and
-        ``floor``, the smallest standard deviation that null records may give a score.
-    z, ratio : ndarray (..., row, window, tau)
-        Near-normal score; observed over expected.
-    rows : sequence of str, optional
-        Axes of each row, separated by blanks; by default a row is an axis of the record.
-    estimate : ndarray, optional
-        Size of the mismatch.
-    one_sided : bool
-        Whether only an excess is a mismatch.
+    These are its near-normal score ``z``, the ``ratio`` of observed over expected, and perhaps an
+    ``estimate``, the size of the mismatch. Columns have ``what`` (str), ``tau_min_s``,
+    ``tau_max_s`` [s], ``frequency`` [Hz] and ``floor``, the smallest standard deviation that null
+    records may give a score. The rows are axes, separated by blanks; by default each axis of the
+    record. Only an excess is a mismatch in a one-sided statistic.
     """
     dims = ("record", "row", "window", "tau") if z.ndim == 4 else ("row", "window", "tau")
     begin, end = blocks["begin"].values, blocks["end"].values

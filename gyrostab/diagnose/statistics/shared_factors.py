@@ -87,16 +87,9 @@ def _weight_bandwidths(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Weight the bandwidths by their likelihood, interpolated between those of the grid.
 
-    White noise has the same prior probability as all low-passes together.
-
-    Returns
-    -------
-    width, share : ndarray, shape (point,)
-        Bandwidths [Hz] and their probabilities.
-    product, error : ndarray, shape (point, pair)
-        Products of the factors, and their errors.
-    limit : ndarray, shape (point, axis)
-        The largest factor that the power of the axis allows.
+    White noise has the same prior probability as all low-passes together. Returned are bandwidths
+    [Hz] and their probabilities (point,), products of the factors and their errors (point, pair),
+    and the largest factor that the power of each axis allows (point, axis).
     """
     from scipy.interpolate import CubicSpline
 
