@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
@@ -29,8 +28,6 @@ from gyrostab.diagnose.locate.mismatches import Region, locate_mismatches
 from gyrostab.diagnose.nulls.records import repeatable_null_records
 from gyrostab.diagnose.nulls.scores import NullScores, null_scores
 from gyrostab.diagnose.reduce.aligned_channels import align_channels
-from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.reduce.moving_blocks import without_motion
 from gyrostab.diagnose.result.attribution import drop_expected
 from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.diagnose.result.finish import finish_diagnosis
@@ -153,11 +150,11 @@ def _reduce_recording(task: Task, block: Any) -> tuple[Task, xr.Dataset]:
         warnings.warn(note, stacklevel=5)
     log = aligned.log.assign_attrs(unused_channels=aligned.unused)
     simulation = task.simulation
-    blocks = reduce_log(log, block=block, restart_gap=task.restart_gap, progress=task.progress)
+    blocks = task.reduce(log, block=block)
     axes = varying_axes(blocks)
     if len(axes) < log.sizes["axis"]:  # whether zeros are filled depends on all axes
         log = log.sel(axis=axes)
-        blocks = reduce_log(log, block=block, restart_gap=task.restart_gap, progress=task.progress)
+        blocks = task.reduce(log, block=block)
         simulation = simulation.sel(axis=axes) if isinstance(simulation, xr.Dataset) else simulation
     return replace(task, log=log, simulation=simulation), blocks
 
@@ -171,7 +168,8 @@ def _calibrate_baseline(task: Task, blocks: xr.Dataset) -> tuple[xr.Dataset, xr.
     baseline = _make_baseline(task, blocks)
     moving = expect_known_motion(blocks, baseline, settings=task.settings)
     if moving.any():
-        at_rest = _at_rest(task, blocks, moving).drop_vars("moving")  # the model has the motion
+        # the model has the motion
+        at_rest = task.without_motion(blocks, moving).drop_vars("moving")
         blocks = filtered_blocks(at_rest, task.simulation)
         baseline = _make_baseline(task, blocks)
     return blocks, baseline
@@ -185,10 +183,7 @@ def _make_baseline(task: Task, blocks: xr.Dataset) -> xr.Dataset:
         return baseline_from_model(
             blocks, task.simulation, quiet=task.quiet, settings=task.settings
         )
-    same_block = f"{blocks.attrs['block_samples']}samples"
-    simulated = reduce_log(
-        task.simulation, block=same_block, restart_gap=task.restart_gap, progress=task.progress
-    )
+    simulated = task.reduce(task.simulation, block=f"{blocks.attrs['block_samples']}samples")
     return baseline_from_simulation(blocks, simulated, quiet=task.quiet, settings=task.settings)
 
 
@@ -252,7 +247,7 @@ def _leave_out_motion(task: Task, named: NamedBlocks) -> NamedBlocks | None:
     if not moving.any():
         return None
     try:
-        calibrated = _calibrate_baseline(task, _at_rest(task, blocks, moving))
+        calibrated = _calibrate_baseline(task, task.without_motion(blocks, moving))
     except SchemaError as error:
         warnings.warn(
             f"the diagnosis includes unexplained motion: without it too little is left ({error})",
@@ -289,10 +284,3 @@ def _take_out_fast_switching(task: Task, named: NamedBlocks) -> NamedBlocks | No
     """Identify with a baseline calibrated free of switching within blocks; None without any."""
     baseline = remove_fast_switching(named.identifications, named.baseline)
     return None if baseline is named.baseline else _identify_effects(task, named.blocks, baseline)
-
-
-def _at_rest(task: Task, blocks: xr.Dataset, moving: NDArray[np.bool_]) -> xr.Dataset:
-    """Return the block statistics of the log without the moving blocks."""
-    return without_motion(
-        task.log, blocks, moving, restart_gap=task.restart_gap, progress=task.progress
-    )

@@ -17,6 +17,7 @@ from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import Identifications
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.moving_blocks import without_motion
 from gyrostab.diagnose.settings import Settings
 from gyrostab.errors import GyrostabError, OptionError, SchemaError
@@ -178,6 +179,16 @@ class Task:
     progress: Stage
     settings: Settings
 
+    def reduce(self, log: xr.Dataset, *, block: Any) -> xr.Dataset:
+        """Reduce a log to block statistics."""
+        return reduce_log(log, block=block, restart_gap=self.restart_gap, progress=self.progress)
+
+    def without_motion(self, blocks: xr.Dataset, moving: NDArray[np.bool_]) -> xr.Dataset:
+        """Return the block statistics of the recording without the moving blocks."""
+        return without_motion(
+            self.log, blocks, moving, restart_gap=self.restart_gap, progress=self.progress
+        )
+
 
 class NamedBlocks(NamedTuple):
     """A recording with the effects that are identified in it."""
@@ -209,9 +220,7 @@ def take_lines_at_rest(task: Task, blocks: xr.Dataset, moving: NDArray[np.bool_]
     has_data = np.isfinite(blocks["power"].values).any(axis=-1)
     if not (moving & has_data).any():
         return blocks
-    at_rest = without_motion(
-        task.log, blocks, moving | ~has_data, restart_gap=task.restart_gap, progress=task.progress
-    )
+    at_rest = task.without_motion(blocks, moving | ~has_data)
     lines = {name: at_rest[name] for name in ("line_power", "line_weight")}
     stays = xr.DataArray(~moving.any(axis=1), dims="axis")
     lines["sine_nats"] = blocks["sine_nats"].where(stays, -np.inf)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.reduce.log_blocks import finite_range, numeric_channels
 from gyrostab.errors import UnitError
+from gyrostab.physics.phase import turns_of_samples
 from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.time.grid import first_stamp, grid_times
 from gyrostab.units import INNER, parse_unit
@@ -52,11 +53,9 @@ class RotationOrders:
         index = np.arange(block_range.start * self.length, block_range.stop * self.length)
         instants = grid_times(self.start, self.rate, index)
         rotation, self.carry = self.source.at(instants, self.carry)
-        inside = rotation * self.factor / (360.0 * self.rate)
-        edges = np.cumsum(np.concatenate([[self.turns], inside]))
-        self.turns = math.fmod(float(edges[-1]), 1.0)
-        shape = (-1, self.length)
-        return (edges[:-1] + inside / 2.0).reshape(shape), inside.reshape(shape)
+        turns, inside, end = turns_of_samples(rotation * self.factor, self.rate, self.turns)
+        self.turns = math.fmod(end, 1.0)
+        return turns.reshape(-1, self.length), inside.reshape(-1, self.length)
 
     def measure(
         self,

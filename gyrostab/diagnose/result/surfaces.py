@@ -146,10 +146,8 @@ def _known_avar(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> A
 def _average_windows(blocks: xr.Dataset, values: Array, windows: Windows) -> Array:
     """Average over windows, weighted with the samples present where the recording has a mean."""
     weight = np.where(np.isfinite(blocks["mean"].values), blocks["samples"].values, 0.0)
-    sums = sum_over_windows((np.where(weight > 0, values, 0.0) * weight)[..., None], windows)[
-        ..., 0
-    ]
-    total = sum_over_windows(weight[..., None], windows)[..., 0]
+    sums = sum_over_windows(np.where(weight > 0, values, 0.0) * weight, windows, axis=-1)
+    total = sum_over_windows(weight, windows, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.where(total > 0, sums / total, np.nan))
 

@@ -7,6 +7,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from gyrostab.diagnose.predict.windows import fill_linearly
 from gyrostab.diagnose.reduce.outliers import (
     EXPECTED_FALSE_OUTLIERS,
     probability_all_zero,
@@ -38,7 +39,7 @@ def null_counts(
     """
     samples = blocks["samples"].values.astype(np.int64)
     adjacent = blocks["adjacent"].values.astype(np.int64)
-    mean = [_interpolate_missing(row, np.isfinite(row)) for row in blocks["mean"].values]
+    mean = [np.nan_to_num(fill_linearly(row)) for row in blocks["mean"].values]
     scatter, correlation = _neighbour_statistics(blocks, sd)
     truncated = truncated_axes(blocks)
     nothing = np.zeros(samples.shape[1])
@@ -89,9 +90,9 @@ def _neighbour_statistics(blocks: xr.Dataset, sd: Array) -> tuple[Array, Array]:
         typical = good & (blocks["outliers"].values[axis] == 0)
         good = typical if typical.any() else good
         if good.any():
-            scatter[axis] = np.sqrt(_interpolate_missing(variance, good))
+            scatter[axis] = np.sqrt(fill_linearly(np.where(good, variance, np.nan)))
             with np.errstate(divide="ignore", invalid="ignore"):
-                correlation[axis] = _interpolate_missing(lagged / variance, good)
+                correlation[axis] = fill_linearly(np.where(good, lagged / variance, np.nan))
         else:
             scatter[axis] = sd[axis, 0]
             correlation[axis] = 1.0 - 0.5 * (sd[axis, 1] / sd[axis, 0]) ** 2
@@ -124,12 +125,6 @@ def _filled_zeros(
         at_once = rng.binomial(number, probability_all_zero(share, subset))
         coinciding = np.minimum(np.einsum("sa,rsb->rab", subset.astype(np.int64), at_once), zeros)
     return zeros_beyond_chance(coinciding, zeros, samples, subset, number)
-
-
-def _interpolate_missing(values: Array, good: NDArray[np.bool_]) -> Array:
-    """Interpolate between good values; 0 without any."""
-    place = np.arange(values.size)
-    return np.interp(place, place[good], values[good]) if good.any() else np.zeros(values.size)
 
 
 def _grid_chance(

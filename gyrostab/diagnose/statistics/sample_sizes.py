@@ -37,25 +37,21 @@ def estimate_from_counts(
     settings: Settings,
 ) -> dict[str, tuple[float, ...]]:
     """Estimate the parameters of an effect on the sample distribution."""
-    samples = max(float(blocks["samples"].sel(axis=axis).sum()), 1.0)
+    on_axis = blocks.sel(axis=axis)
+    samples = max(float(on_axis["samples"].sum()), 1.0)
     rate = float(blocks.attrs["sampling_rate_hz"])
     hours = samples / rate / HOUR
     if mark == "lattice":
-        return {"step": (float(blocks["quantization_step"].sel(axis=axis)), 0.0)}
+        return {"step": (float(on_axis["quantization_step"]), 0.0)}
     row = [str(name) for name in blocks["axis"].values].index(axis)
     usual = float(count_evidence.of[mark][0][row].sum()) if mark in count_evidence.of else 0.0
-    count = max(float(blocks[mark].sel(axis=axis).sum()) - usual, 1.0)
-    # standard deviation of the samples about their block means [degree hour-1]
-    spread = math.sqrt(float(blocks["variance"].sel(axis=axis).median()))
-    error = math.sqrt(count + usual)
     if effect == "spikes":
-        peaks = blocks["peaks"].sel(axis=axis).where(blocks[mark].sel(axis=axis) > 0)
-        count = max(float(peaks.sum()), 1.0)
+        count = max(float(on_axis["peaks"].where(on_axis[mark] > 0).sum()), 1.0)
         return _size_spikes(count, hours, _estimate_outliers(blocks, axis), settings)
     if effect == "held_samples":
-        if not float(blocks["quantization_step"].sel(axis=axis)) > 0.0:
+        if not float(on_axis["quantization_step"]) > 0.0:
             usual = 0.0  # without a quantization grid chance repeats no sample
-        count = max(float(blocks[mark].sel(axis=axis).sum()) - usual, 1.0)
+        count = max(float(on_axis[mark].sum()) - usual, 1.0)
         runs = _held_runs(blocks, axis, mark, usual)
         # of a geometric law, whose standard deviation is its mean
         length = max(count / runs, 1.0) / rate
@@ -70,11 +66,11 @@ def estimate_from_counts(
             ),
         }
     if effect == "clipping":
-        return {"limit": _size_range(blocks.sel(axis=axis), spread, samples)}
+        # standard deviation of the samples about their block means [degree hour-1]
+        spread = math.sqrt(float(on_axis["variance"].median()))
+        return {"limit": _size_range(on_axis, spread, samples)}
     if effect == "dead_zone" and has_empty_zone(blocks, axis):
-        width, error = (
-            float(blocks[name].sel(axis=axis)) for name in ("zone_width", "zone_width_stderr")
-        )
+        width, error = (float(on_axis[name]) for name in ("zone_width", "zone_width_stderr"))
         # the least of many samples beyond the zone is that far from its edge, by an exponential law
         return {"width": (width, error, width + error * math.log(INTERVAL_TAILS[0]), width)}
     if effect == "dead_zone":
@@ -83,9 +79,10 @@ def estimate_from_counts(
             for name in ("samples", "mean", "variance")
         )
         good = np.isfinite(means) & (samples_of > 0.0)
-        centre = float(np.nan_to_num(blocks["zone_centre"].sel(axis=axis)))
+        centre = float(np.nan_to_num(on_axis["zone_centre"]))
         variance = float(weighted_mean(variances, samples_of)[0])
         law = samples_of[good], means[good] - centre, variance
+        count = max(float(on_axis[mark].sum()) - usual, 1.0)
         low, high = (end - usual for end in _poisson_interval(count + usual))
         width, narrow, wide = (_zone_width(number / samples, *law) for number in (count, low, high))
         return {"width": (width, (wide - narrow) / (2.0 * NORMAL_95), narrow, wide)}
@@ -156,8 +153,8 @@ def _size_range(blocks: xr.Dataset, spread: float, samples: float) -> tuple[floa
     """
     lowest, highest = blocks["range_end"].values.tolist()
     half = 0.5 * (highest - lowest)
-    limit = highest - centre_of_range(blocks)
-    limit = max(limit, centre_of_range(blocks) - lowest)
+    centre = centre_of_range(blocks)
+    limit = max(highest - centre, centre - lowest)
     if limit == half:
         return limit, 0.0, limit, limit
     beyond = spread / -float(ndtri(1.0 / (samples + 1.0)))
