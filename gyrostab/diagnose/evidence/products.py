@@ -98,21 +98,10 @@ def mean_products(
 ) -> Products:
     """Compute products of block means and columns, whitened for every pair of K and B.
 
-    Parameters
-    ----------
-    values : ndarray, shape (block, record)
-        Block means [degree hour-1]; anything where not `present`.
-    columns : ndarray, shape (block, column)
-        Designs.
-    variance : ndarray, shape (block,)
-        White variance of the means [degree2 hour-2].
-    K, B : ndarray, shape (grid,)
-        Random walk [deg/h^1.5] and flicker [deg/h].
-    present : ndarray of bool, shape (block,)
-        Blocks that are used.
-    pairs : two ndarrays, optional
-        Columns whose products are needed, from `column_pairs`; other products are 0. All by
-        default.
+    The values (block, record) are block means [degree hour-1], or anything where not `present`
+    (block,); the columns (block, column) are designs. The noise has the white variance (block,)
+    [degree2 hour-2], and random walk K [deg/h^1.5] and flicker B [deg/h] by (grid,). Products of
+    columns that are not among `pairs`, from `column_pairs`, are 0; by default all are computed.
     """
     n, width = columns.shape
     stacked = np.ascontiguousarray(np.concatenate([columns, values], axis=1))

@@ -329,16 +329,9 @@ def course_evidence(
 ) -> tuple[float, float]:
     """Compute log evidences without and with a course, averaged over a noise grid.
 
-    Parameters
-    ----------
-    place : int
-        Index of the record and its course in the products.
-    scatter : float
-        Variance of the course over the white variance.
-    log_weight : ndarray, shape (grid,)
-        Log weights of the grid points.
-    unit : float
-        Square of the course over the white variance, the scale of the prior of the step (`WIDTHS`).
+    `place` is the index of the record and its course in the products. The variance of the course,
+    `scatter`, and its square, `unit`, are relative to the white variance; the latter is the scale
+    of the prior of the step (`WIDTHS`).
     """
     base = (log_weight - 0.5 * (products.square[:, place] + products.log_determinant))[None]
     size = 1.0 / np.sqrt(max(unit + scatter, 1e-300))

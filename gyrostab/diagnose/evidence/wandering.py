@@ -62,13 +62,9 @@ def with_process(
 ) -> xr.Dataset:
     """Return the baseline with another random process in the mean of an axis.
 
-    Parameters
-    ----------
-    variance : ndarray, shape (block,)
-        Of a process that is exponentially correlated, the same in all blocks [degree2 hour-2]; of a
-        random walk, what its variance grows by in a second [degree2 hour-2 s-1].
-    time : float
-        Correlation time [s]; infinite for a random walk.
+    The variance (block,) of a process with a correlation `time` [s] is the same in all blocks
+    [degree2 hour-2]. A random walk has an infinite time, and a variance that grows by so much in a
+    second [degree2 hour-2 s-1].
     """
     axes = baseline["axis"].values.tolist()
     row, shape = axes.index(axis), (len(axes), baseline.sizes["block"])

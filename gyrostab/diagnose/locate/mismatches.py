@@ -41,19 +41,9 @@ def locate_mismatches(
     Every statistic scores its cells, in standard deviations of the null records. The p-value of a
     score is the share of null records in which any cell of any statistic reaches it. From the
     largest score on, cells become regions: the time that explains most, and the neighbouring
-    averaging times that exceed noise there. What a region explains is left out of the next.
-
-    Parameters
-    ----------
-    null : NullScores
-        Scores of null records, from `gyrostab.diagnose.nulls.scores.null_scores`.
-    level : float
-        Probability that a recording without missing physics has any mismatch.
-
-    Returns
-    -------
-    list of Region
-        The surest first.
+    averaging times that exceed noise there. What a region explains is left out of the next. A
+    recording without missing physics has any mismatch with the probability `level`. The surest
+    region is the first.
 
     Examples
     --------

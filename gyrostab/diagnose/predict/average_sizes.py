@@ -32,20 +32,12 @@ def average_sizes(
     Exponents have their defaults and lags are zero unless other values are better by 3 nats and an
     error of the form. The scatter of the sizes includes all lags that the record allows, even when
     the lag is given as zero. Exponents are not averaged over, because each gives the size another
-    unit.
-
-    Parameters
-    ----------
-    state : State
-        With all other effects in the model.
-    candidates : sequence of Candidate
-        All that were tried; they have the grid.
+    unit. The state has all other effects in the model, and the candidates are all that were tried;
+    they have the grid.
 
     Returns
     -------
-    mean : ndarray, shape (column,)
-    covariance : ndarray, shape (column, column)
-        About that mean.
+    mean, covariance : ndarray, shape (column,) and (column, column)
     ends : ndarray, shape (2, column)
         Ends of the 95 % intervals: those of a normal law, but not beyond the values that the grid
         supports. Sizes at neighbours on a coarse grid may differ by many standard errors, and the

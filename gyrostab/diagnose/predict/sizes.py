@@ -29,15 +29,9 @@ def mean_mixture(
 ) -> Mixture:
     """Compute the sizes of columns of the block means of an axis, over the grid of K and B.
 
-    The columns of named effects are free.
-
-    Parameters
-    ----------
-    columns : sequence of ndarray, shape (block,)
-    tier : {"free", "calibrated"}
-        Freedom of the noise, as in `gyrostab.diagnose.evidence.held_out.mean_factors`.
-    variance : ndarray, shape (block,), optional
-        White variance of the means instead of the baseline's [degree2 hour-2].
+    The columns (block,) of named effects are free; `tier` is the freedom of the noise, as in
+    `gyrostab.diagnose.evidence.held_out.mean_factors`. The white variance of the means (block,)
+    [degree2 hour-2] is that of the baseline unless it is given.
     """
     baseline = state.baseline
     y = mean_residual(state.blocks, baseline, axis)[:, 0]

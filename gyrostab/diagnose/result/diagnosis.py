@@ -166,12 +166,7 @@ def effect_table(effect: Effect) -> dict[str, Any]:
 
 
 def model_text(model: Mapping[str, Any], *, heading: str = "") -> str:
-    """Write the tables of a model as TOML.
-
-    Parameters
-    ----------
-    model : mapping
-        Tables ``noise``, ``log`` and lists of tables ``effect``, ``environment``.
+    """Write a model as TOML: tables ``noise``, ``log``, lists ``effect``, ``environment``.
 
     Examples
     --------

@@ -40,20 +40,9 @@ _SURFACES = {
 def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> xr.Dataset:
     """Compute Allan variances and window means of the recording, and of both simulations.
 
-    Parameters
-    ----------
-    before, after : xarray.Dataset
-        Baselines without and with the effects.
-
-    Returns
-    -------
-    xarray.Dataset
-        ``avar`` (case, axis, window, tau) [degree2 hour-2], case one of `CASES`; ``avar_low``,
-        ``avar_high``, the band of 95 % of recordings of that simulation (NaN for the recording
-        itself); ``mean`` (case, axis, window) [degree hour-1] and ``mean_stderr``, the standard
-        deviation of a recording of that simulation; coordinates ``begin``, ``end`` [s since the
-        start], ``time``, ``tau`` [s]. For the report also block means, channels and spectra of the
-        whole record.
+    The baselines are those without and with the effects; ``case`` is one of `CASES`. The results
+    have the variables of `_SURFACES`, with the 95 % bands and standard deviations of recordings of
+    that simulation (NaN for the recording itself), and block means and channels for the report.
     """
     windows = _make_windows(blocks.sizes["block"])
     plain = before.assign(known_mean=before["known_mean"] * 0.0)
