@@ -18,7 +18,6 @@ INTERVAL_TAILS = (0.025, 0.975)
 
 
 def _make_setting(value: float, unit: str, meaning: str, source: str) -> Any:
-    """Declare a setting."""
     return field(default=value, metadata={"unit": unit, "meaning": meaning, "source": source})
 
 
@@ -432,7 +431,6 @@ class Settings:
     )
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         for item in fields(self):
             value = getattr(self, item.name)
             if not (math.isfinite(value) and value >= 0.0):

@@ -130,6 +130,5 @@ def _changed_rows(axes: tuple[str, ...], effects: Sequence[Effect]) -> list[tupl
 
 
 def _noise_before(effect: Effect, blocks: xr.Dataset, row: int) -> PassedNoise:
-    """Return the noise of an axis before an effect."""
     mean = blocks["mean"].values[row]
     return undo_transfer(effect.transfer, mean, _variance_of_axis(blocks, row))

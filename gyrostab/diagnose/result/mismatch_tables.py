@@ -75,7 +75,6 @@ def mismatch_tables(
 def _located_mismatches(
     mismatches: Sequence[Region], blocks: xr.Dataset, explained: Sequence[Sequence[str]]
 ) -> list[dict[str, Any]]:
-    """Return the located mismatches."""
     record_s = float(blocks["end"].values[-1])
     out = []
     for region, names in zip(mismatches, explained, strict=True):

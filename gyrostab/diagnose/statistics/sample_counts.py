@@ -134,7 +134,6 @@ class SampleCounts(Statistic):
             yield Variant(case.values, case.prediction.marks, np.empty(0))
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
-        """Compute the evidence in sample counts."""
         if trial.counts is None:
             return []
         subsets = fold_subsets(trial.folds)
