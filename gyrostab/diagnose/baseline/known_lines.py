@@ -79,7 +79,8 @@ def resonance_density(
 
     Its peak may be narrower than the width of the taper.
     """
-    if not math.isfinite(getattr(effect, "quality", math.inf)):
+    # the quality of aliased vibration is that of a mount, above the frequencies of the record
+    if not (hasattr(effect, "frequency") and math.isfinite(getattr(effect, "quality", math.inf))):
         return None
     frequency = blocks["line_frequency"].values
     fine = _between_lines(frequency)

@@ -76,6 +76,23 @@ def test_only_a_line_well_above_the_model_is_reported(lost):
     assert left(1.5) > 20.0
 
 
+@pytest.mark.parametrize("sampling", ["point", "average"])
+def test_aliased_vibration_of_a_model_is_no_resonance(sampling):
+    """It has the quality of a mount, and a power that follows the vibration."""
+    shake = {"profile": "vibration", "points": [[0, 1.0], [850, 1.0], [851, 3.0], [1800, 3.0]]}
+    effect = {"name": "aliased_vibration", "low": 63.0, "high": 67.0, "sampling": sampling}
+    effect |= {"sensitivity": 1.0 if sampling == "point" else 20.0}
+    made = {"noise": NOISE, "effect": [effect], "environment": [shake], "log": {"axes": ["x"]}}
+    blocks = reduce_log(simulate(made, duration="30min", rate=10.0, seed=4).compute())
+    expected = baseline_from_model(blocks, made)["spectrum"].values[0]
+    noise = baseline_from_model(blocks, made | {"effect": []})["spectrum"].values[0]
+    late = blocks["begin"].values > 900.0
+    for part in (late, ~late):
+        means = [values[part].mean(axis=0) for values in (blocks["power"].values[0], expected)]
+        np.testing.assert_allclose(means[0][-4:], means[1][-4:], rtol=0.15)
+    assert expected[late, -4:].mean() > 3.0 * noise[late, -4:].mean()
+
+
 def test_null_records_have_the_peaks_of_the_model():
     made = model(0.5, quality=30.0)
     blocks = reduce_log(simulate(made, duration="1h", rate=10.0, seed=2).compute())
