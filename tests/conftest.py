@@ -64,7 +64,7 @@ def recordings() -> Callable[[str], Path]:
 
 @pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:
-    """Use one thread for the linear algebra, as `gyrostab.diagnose` does."""
+    """Use one thread for the linear algebra, as `gyrostab.diagnose` and `gyrostab prove` do."""
     with threadpool_limits(1, user_api="blas"):
         yield
 

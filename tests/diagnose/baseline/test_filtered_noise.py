@@ -16,7 +16,6 @@ from tests.support.named import name_effects, nulls
 from tests.support.repetitions import first_of
 
 RATE, N = 20.0, 0.05
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def filtered_blocks(

@@ -52,7 +52,6 @@ def test_a_model_expects_its_own_filter(filtering):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("filtering", first_of({"cutoff": 2.0}, {"length": 0.5}), ids=str)
-@pytest.mark.usefixtures("one_thread")
 def test_a_recording_does_not_differ_from_its_own_filter(filtering):
     model = made(**filtering)
     log = simulate(model, duration="30min", rate=10.0, seed=4).compute()
@@ -61,7 +60,6 @@ def test_a_recording_does_not_differ_from_its_own_filter(filtering):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("one_thread")
 def test_aliases_of_white_noise_are_not_taken_for_bias_instability():
     log = simulate(
         made("x", cutoff=58.0, order=1.0, pick=1.0, oversampling=16),
@@ -78,7 +76,6 @@ def test_aliases_of_white_noise_are_not_taken_for_bias_instability():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("one_thread")
 def test_a_named_filter_of_a_fast_instrument_simulates_the_recording():
     log = simulate(
         made("x", cutoff=6.0, order=4.0, oversampling=16), duration="30min", rate=10.0, seed=5

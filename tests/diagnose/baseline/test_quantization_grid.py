@@ -19,8 +19,6 @@ from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import name_effects, nulls
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 SCATTER = 0.003 * 60.0 * np.sqrt(10.0)  # of a sample at 10 Hz [deg/h]
 
 

@@ -29,8 +29,6 @@ from tests.support.effect_bench import run
 from tests.support.named import name_effects, nulls
 from tests.support.repetitions import first_of
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 SCATTER = 0.5  # deg/h, of a sample
 
 

@@ -357,14 +357,14 @@ def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) ->
 
 
 @pytest.mark.slow
-def test_search_withdraws_jumps_that_are_switches(one_thread) -> None:
+def test_search_withdraws_jumps_that_are_switches() -> None:
     """A noisy supply delays the switches; their last jump is named first, then withdrawn."""
     identifications = switched([0, 8, 1, 21, 1, 33, 21], 9, step=0.6, scatter=0.45)
     assert [identification.effect for identification in identifications.identified] == ["telegraph"]
     assert not identifications.unknown
 
 
-def test_search_names_a_switching_channel_before_a_telegraph(one_thread) -> None:
+def test_search_names_a_switching_channel_before_a_telegraph() -> None:
     """Two levels have more evidence than a noisy supply, but the supply is the cause."""
     identifications = switched([45, 14, 3, 12, 3, 10, 3, 5], 1, step=0.6, scatter=0.3)
     assert [identification.effect for identification in identifications.identified] == [

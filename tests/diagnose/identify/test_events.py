@@ -24,8 +24,6 @@ from tests.support.candidates import find_components
 from tests.support.named import name_effects, nulls
 from tests.support.repetitions import first_of
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 BLOCKS, LENGTH, RATE = 120, 200, 10.0
 WHITE = 0.003 * 60.0 * np.sqrt(RATE)
 SECOND = np.arange(BLOCKS * LENGTH) / RATE

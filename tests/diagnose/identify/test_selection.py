@@ -33,8 +33,6 @@ from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import select_candidate
 from tests.support.named import WORLD, name_effects, nulls, record
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def identify(effects, *, axes="xyz", environment=WORLD["usual"], seed=1, drop=(), count=40):
     blocks = record(effects, axes=axes, environment=environment, seed=seed, drop=drop)

@@ -14,7 +14,6 @@ from gyrostab.ingest.make_log import make_log
 from tests.support.named import name_effects, nulls
 
 RATE, SECONDS = 20.0, 1200
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def shaken_record(kind: str, *, seed: int = 5) -> xr.Dataset:

@@ -23,8 +23,6 @@ from tests.support.named import name_effects, nulls
 
 BLOCKS, LENGTH = 120, 200
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def record(factor: np.ndarray, *, seed: int = 1, gaps: bool = False) -> xr.Dataset:
     """White noise at 10 Hz on one axis, scaled by a factor in each block of 20 s."""

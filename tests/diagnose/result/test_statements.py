@@ -24,7 +24,6 @@ from tests.support.named import name_effects, nulls
 from tests.support.repetitions import first_of
 
 RATE = 50.0
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def shaken_blocks(seed: int, *, band_hz: tuple[float, float] | None) -> xr.Dataset:
