@@ -14,11 +14,10 @@ now names otherwise. `ALLOWED` lists the exceptions with their reasons.
 from __future__ import annotations
 
 import ast
-import io
 import re
 import sys
-import tokenize
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -128,21 +127,26 @@ def without_code(text: str) -> str:
     return re.sub(r"(`+)[^`\n]+\1", "``", text)
 
 
+#: Comments and strings of Python: of a string, its prefix and what is between its quotes.
+PYTHON_TEXT = re.compile(
+    r"""#(?P<comment>[^\n]*)"""
+    r"""|(?P<prefix>\b[A-Za-z]{1,2})?(?P<quotes>\"{3}|'{3}|"|')(?P<text>(?:\\.|[^\\])*?)(?P=quotes)""",
+    re.DOTALL,
+)
+
+
 def texts_of_python(source: str) -> Iterator[tuple[int, str]]:
     """Comments and strings of more than one word, each with its first line."""
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT:
-            yield token.start[0], token.string.lstrip("#: ")
-        elif token.type == tokenize.STRING:
-            prefix, text = re.fullmatch(
-                r"""(\w*)(?:\"{3}|'{3}|"|')(.*?)(?:\"{3}|'{3}|"|')""", token.string, re.DOTALL
-            ).groups()
-            if "f" in prefix.lower():
-                text = re.sub(r"\{[^{}]*\}", "{}", text)
-            if " " in text:
-                yield token.start[0], text
-        elif token.type == getattr(tokenize, "FSTRING_MIDDLE", -1) and " " in token.string:
-            yield token.start[0], token.string
+    line, place = 1, 0
+    for match in PYTHON_TEXT.finditer(source):
+        text = match["text"]
+        if match["comment"] is not None:
+            text = match["comment"].lstrip("#: ")
+        elif "f" in (match["prefix"] or "").lower():
+            text = re.sub(r"\{[^{}]*\}", "{}", text)
+        if match["comment"] is not None or " " in text:
+            line, place = line + source.count("\n", place, match.start()), match.start()
+            yield line, text
 
 
 def texts_of_markdown(source: str) -> Iterator[tuple[int, str]]:
@@ -175,17 +179,24 @@ def texts_of(path: Path) -> Iterator[tuple[int, str]]:
         yield from enumerate(source.splitlines(), 1)
 
 
+@cache
+def patterns_in(diagnosis: bool) -> list[tuple[Callable[[str], Iterator[re.Match]], str]]:
+    """What finds each pattern, with its advice."""
+    patterns = PHRASES | OLD_WORDS | (OLD_WORDS_OF_DIAGNOSIS if diagnosis else {})
+    return [(re.compile(pattern).finditer, advice) for pattern, advice in patterns.items()]
+
+
 def find_phrases(path: Path, name: str) -> Iterator[Finding]:
     """Phrases and old words in the prose of a file, also where a line breaks within them."""
-    patterns = PHRASES | OLD_WORDS | (OLD_WORDS_OF_DIAGNOSIS if name.startswith(DIAGNOSIS) else {})
+    patterns = patterns_in(name.startswith(DIAGNOSIS))
     for first, text in texts_of(path):
         cleaned = re.sub(r"\n[ \t]+", "\n", without_code(text))
         for allowed in ALLOWED:
             if name.startswith(allowed.path):
                 cleaned = cleaned.replace(allowed.phrase, "")
         flat = cleaned.replace("\n", " ")
-        for pattern, advice in patterns.items():
-            for match in re.finditer(pattern, flat):
+        for find_matches, advice in patterns:
+            for match in find_matches(flat):
                 line = first + cleaned.count("\n", 0, match.start())
                 context = flat[max(0, match.start() - 30) : match.end() + 30]
                 yield Finding(name, line, f"...{context}...", advice)
@@ -206,7 +217,10 @@ def find_names(path: Path, name: str) -> Iterator[Finding]:
 
 def find_role_words(path: Path, name: str) -> Iterator[Finding]:
     """Find variables and parameters that are not named by what they hold."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    source = path.read_text(encoding="utf-8")
+    if ROLE_WORDS.isdisjoint(re.findall(r"\w+", PYTHON_TEXT.sub("''", source))):
+        return
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.arg):
             variable = node.arg
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
