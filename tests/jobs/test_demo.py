@@ -23,9 +23,10 @@ DATA = Path(__file__).resolve().parents[2] / "data"
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory) -> tuple[Path, str]:
-    """The folder that the demo wrote, and what it printed."""
+    """The folder that the demo wrote, with coarse pictures, and what it printed."""
     folder, shown = tmp_path_factory.mktemp("demo"), io.StringIO()
-    with contextlib.redirect_stdout(shown):
+    with contextlib.redirect_stdout(shown), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gyrostab.jobs.demo._DPI", 40)
         assert main(["demo", "-o", str(folder), "--quiet-progress"]) == 0
     return folder, shown.getvalue()
 
