@@ -74,7 +74,8 @@ class NothingFound:
 def small(monkeypatch):
     """Benchmarks of two small cases; the figures of `finished` are drawn, those of others empty."""
     monkeypatch.setattr(
-        "gyrostab.plot.save_png", lambda figure, target, **_: Path(target).write_bytes(b"")
+        "gyrostab.blindtest.runner.outcome.save_png",
+        lambda figure, target, **_: Path(target).write_bytes(b""),
     )
     monkeypatch.setattr("gyrostab.blindtest.scenarios.plan.plan_cases", small_plans)
     monkeypatch.setitem(core._DEFAULTS, "counterparts", 0)
@@ -587,13 +588,11 @@ def test_command_warns_of_a_tuning_seed(tmp_path, capfd):
 def test_processes_keep_order_and_use_one_thread():
     counts: list[int] = []
     before = os.environ.get("OMP_NUM_THREADS")
-    done = run_in_processes(
-        os.path.join, [("a", str(number)) for number in range(5)], workers=2, report=counts.append
-    )
-    assert done == [os.path.join("a", str(number)) for number in range(5)]
-    assert counts == [1, 2, 3, 4, 5]
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    assert run_in_processes(os.getenv, [(name,) for name in names], workers=1) == ["1", "1", "1"]
+    jobs = [*((name,) for name in names), *(("not set", str(number)) for number in range(5))]
+    done = run_in_processes(os.getenv, jobs, workers=2, report=counts.append)
+    assert done == ["1", "1", "1", *map(str, range(5))]
+    assert counts == list(range(1, 9))
     assert os.environ.get("OMP_NUM_THREADS") == before
 
 

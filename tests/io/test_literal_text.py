@@ -59,7 +59,7 @@ def test_figures_show_names_and_units_as_they_are(tmp_path):
         plot.plot_adev(product, formula),
     ]
     for figure in (*figures, *(draw() for draw in product_figures(product).values())):
-        save_png(figure, tmp_path / "figure.png")
+        save_png(figure, tmp_path / "figure.png", dpi=40)
         shown = [text.get_text() for text in figure.findobj(Text) if formula in text.get_text()]
         assert shown
     write_report(product, tmp_path / "report.html", log=log)

@@ -419,7 +419,14 @@ def test_two_runs_of_one_output_at_once(log, tmp_path, capfd):
     assert call(log, "-o", output) == 0
 
 
-@pytest.mark.parametrize(("calls", "kills"), [(4, 2), pytest.param(16, 8, marks=pytest.mark.full)])
+@pytest.mark.parametrize(
+    ("calls", "kills"),
+    [
+        (2, 1),
+        pytest.param(4, 2, marks=pytest.mark.slow),
+        pytest.param(16, 8, marks=pytest.mark.full),
+    ],
+)
 def test_killed_before_changes_of_the_disk_and_at_random(log, tmp_path, calls, kills):
     seed = random.SystemRandom().randrange(10**6)
     print(f"seed {seed}")

@@ -435,8 +435,9 @@ for count in range(2, len(files) + 1, 4):
 def test_memory_does_not_grow_with_the_files_that_were_read(tmp_path):
     rows = 40_000
     cells = np.random.default_rng(1).standard_normal((rows, 2)).round(4).tolist()
+    ends = [f"0,{x},{y}\n" for x, y in cells]
     for number in range(18):
-        text = "".join(f"{number * rows + i}0,{x},{y}\n" for i, (x, y) in enumerate(cells))
+        text = "".join(f"{number * rows + i}{end}" for i, end in enumerate(ends))
         (tmp_path / f"{number:02}.csv").write_text(
             f"time [ms],gyro_x [deg/h],gyro_y [deg/h]\n{text}"
         )
