@@ -62,9 +62,13 @@ def recordings() -> Callable[[str], Path]:
     return find
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", autouse=True)
 def one_thread() -> Iterator[None]:
-    """Use one thread for the linear algebra, as `gyrostab.diagnose` and `gyrostab prove` do."""
+    """Use one thread for the linear algebra, as `gyrostab.diagnose` does.
+
+    Its threads wait for each other where every core runs a process of tests: small matrices then
+    take five times the processor time.
+    """
     with threadpool_limits(1, user_api="blas"):
         yield
 
