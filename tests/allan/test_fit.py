@@ -56,8 +56,20 @@ def records(kind, rng, trials, n):
     return random_walk(rng, trials, n, K=20.0, rate=RATE), {"K": 20.0}
 
 
-@pytest.mark.parametrize(("share", "block"), [(0.0, 1), (0.2, 50), (0.1, 5)])
-@pytest.mark.parametrize("kind", ["white", "flicker", "random walk"])
+@pytest.mark.parametrize(
+    ("kind", "share", "block"),
+    [
+        ("white", 0.2, 50),
+        ("flicker", 0.1, 5),
+        ("random walk", 0.0, 1),
+        pytest.param("white", 0.0, 1, marks=pytest.mark.slow),
+        pytest.param("white", 0.1, 5, marks=pytest.mark.slow),
+        pytest.param("flicker", 0.0, 1, marks=pytest.mark.slow),
+        pytest.param("flicker", 0.2, 50, marks=pytest.mark.slow),
+        pytest.param("random walk", 0.2, 50, marks=pytest.mark.slow),
+        pytest.param("random walk", 0.1, 5, marks=pytest.mark.slow),
+    ],
+)
 def test_95_percent_intervals_hold_the_truth(kind, share, block):
     """2000 trials at each of nine averaging times; the share of hits has a binomial sd of 0.5 %."""
     rng = np.random.default_rng([1, len(kind), block])
@@ -138,7 +150,14 @@ def test_covariance_between_averaging_times_is_that_of_simulated_noise():
     np.testing.assert_allclose(np.cov(avar.T) / scale, predicted / scale, atol=0.12)
 
 
-@pytest.mark.parametrize(("share", "block"), [(0.0, 1), (0.2, 50), (0.2, 5)])
+@pytest.mark.parametrize(
+    ("share", "block"),
+    [
+        pytest.param(0.0, 1, marks=pytest.mark.slow),
+        pytest.param(0.2, 50, marks=pytest.mark.slow),
+        (0.2, 5),
+    ],
+)
 def test_standard_errors_are_right(share, block):
     """z-scores of repeated simulations have a standard deviation of 0.78 to 1.1, also with gaps.
 

@@ -16,7 +16,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "seeds.md"
 
 
-SLOW = [pytest.mark.full]
+#: Marks of the experiments that are not for `make test-full` alone.
+MARKS = {"x3": [], "l13_vibration": [], "p16_vibration": [pytest.mark.slow]}
 SCRIPT = load_script("docs/generate/seed_experiments.py")
 ERRATA = load_script("benchmarks/seed_errata.py")
 
@@ -202,7 +203,7 @@ def parse(cell: str) -> tuple[str, float]:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[] if name in ("x3", "p16_vibration", "l13_vibration") else SLOW)
+        pytest.param(name, marks=MARKS.get(name, [pytest.mark.full]))
         for name in SCRIPT.PLAN["experiment"]
     ],
 )

@@ -9,9 +9,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -320,6 +321,16 @@ def test_a_worker_process_that_dies_is_explained():
         list(run_calls(pool, [(os._exit, 3)]))
 
 
+def test_repeated_deaths_on_the_same_part_are_explained():
+    future: Future[None] = Future()
+    worker = SimpleNamespace(address="tcp://127.0.0.1:9")
+    future.set_exception(distributed.scheduler.KilledWorker("part", worker, 1))
+    pool = Pool(lambda *call: future, lambda: 1, True, lambda value: value)
+    with pytest.raises(WorkerError, match="died repeatedly on the same part"):
+        list(run_calls(pool, [(os._exit, 3)]))
+
+
+@pytest.mark.slow
 def test_a_part_that_kills_every_worker_is_explained(address):
     with (
         open_pool(address) as pool,

@@ -163,6 +163,7 @@ def test_detection_limit_of_raised_noise(base, null):
     assert below < 0.5 < above
 
 
+@pytest.mark.slow
 def test_detection_limit_of_a_mean_step(base, null):
     def step(blocks, height):
         blocks["mean"][:, 0, EVENT] += height
