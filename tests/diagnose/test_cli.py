@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import tomllib
 from pathlib import Path
 
@@ -188,12 +189,31 @@ def test_noise_without_channels_has_no_mismatch_and_a_constant_axis_is_left_out(
 # manners
 
 
-def test_axis_is_diagnosed_alone(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+def test_axis_is_diagnosed_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+):
+    noise = {"noise": {"N": 0.003}, "log": {"axes": ["x", "y"]}}
+    path = to_netcdf(simulate(noise, duration="1min", rate=10.0, seed=1), tmp_path / "log.nc")
+    axes: list[list[str]] = []
+
+    def stop(log: xr.Dataset, *, simulation: xr.Dataset, **_: object) -> None:
+        axes.extend(given["axis"].values.tolist() for given in (log, simulation))
+        raise OptionError("this is enough")
+
+    monkeypatch.setattr(sys.modules[diagnose.__module__], "diagnose", stop)
+    options = ["--simulation", path, "-o", tmp_path / "found"]
+    assert call("diagnose", path, "--axis", "up", *options) == 2
+    assert "axis 'up' is not in the log; it has x, y" in capfd.readouterr().err
+    assert call("diagnose", path, "--axis", "y", *options) == 2
+    assert "this is enough" in capfd.readouterr().err
+    assert axes == [["y"], ["y"]]
+
+
+@pytest.mark.slow
+def test_diagnosis_of_an_axis_has_this_axis_alone(tmp_path: Path):
     noise = {"noise": {"N": 0.003}, "log": {"axes": ["x", "y"]}}
     to_netcdf(simulate(noise, duration="5min", rate=10.0, seed=1), tmp_path / "log.nc")
     options = ["--nulls", "100", "-o", tmp_path / "found"]
-    assert call("diagnose", tmp_path / "log.nc", "--axis", "up", *options) == 2
-    assert "axis 'up' is not in the log; it has x, y" in capfd.readouterr().err
     assert call("diagnose", tmp_path / "log.nc", "--axis", "y", *options) == 0
     content = json.loads((tmp_path / "found" / "diagnosis.json").read_text())
     assert list(content["baseline"]["noise"]) == ["y"]

@@ -111,6 +111,7 @@ def test_a_coefficient_that_rises_with_age_is_a_trend():
     assert set(trends.index[trends["p_value"] < 0.05]) == {rising.name, size.name}
 
 
+@pytest.mark.slow
 def test_trends_of_noise_are_rarely_found():
     """The probability that chance shows any trend of a fleet is at most 5 %."""
     draw = np.random.default_rng(2)

@@ -188,7 +188,13 @@ def test_a_run_makes_what_the_functions_make(log, whole, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "options", [("--workers", 1), ("--workers", 3), ("--scheduler", "processes", "--workers", 2)]
+    "options",
+    [
+        ("--workers", 1),
+        ("--workers", 3),
+        # as the workers of a dask scheduler, which make the same bytes
+        pytest.param(("--scheduler", "processes", "--workers", 2), marks=pytest.mark.slow),
+    ],
 )
 def test_workers_do_not_change_a_byte(log, whole, tmp_path, options):
     assert call(log, "-o", tmp_path / "product.nc", *options) == 0
