@@ -313,7 +313,7 @@ def lose_samples(kind, share, rows, random):
         pytest.param("single", 0.5, 0.2, 1, marks=pytest.mark.full),
         ("single", 0.6, 0.2, 1000),
         ("single", 0.8, 0.1, 1000),
-        ("single", 0.3, 0.3, 100_000),
+        pytest.param("single", 0.3, 0.3, 100_000, marks=pytest.mark.slow),
         pytest.param("bursts", 0.8, 0.2, 1_000_000, marks=pytest.mark.full),
         ("bursts", 0.4, 0.3, 1_000_000),
     ],

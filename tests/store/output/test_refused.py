@@ -15,6 +15,7 @@ from gyrostab import davar, make_log, open_log, to_netcdf, to_zarr
 from gyrostab.errors import GyrostabError, OptionError, OutputError
 from gyrostab.jobs.job import job_folder
 from gyrostab.jobs.run import run
+from gyrostab.plot.style import save_png
 from gyrostab.store.output import (
     check_output,
     find_foreign_item,
@@ -220,7 +221,10 @@ def test_a_written_dataset_of_xarray_is_an_input_while_it_is_lazy(tmp_path):
 # folders of files
 
 
-def test_the_other_files_of_a_folder_of_figures_stay(folder):
+def test_the_other_files_of_a_folder_of_figures_stay(folder, monkeypatch):
+    monkeypatch.setattr(
+        "gyrostab.plot.figures.save_png", lambda figure, path, dpi: save_png(figure, path, dpi=40)
+    )
     figures = folder / "figures"
     figures.mkdir()
     (figures / "thesis.tex").write_text("years of work")
