@@ -17,6 +17,12 @@ from gyrostab.report import write_report
 from tests.support import synthetic
 
 
+@pytest.fixture
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the pictures empty in tests that are about the text of a page."""
+    monkeypatch.setattr("gyrostab.report.product.encode_png", lambda _: "")
+
+
 class _Page(HTMLParser):
     def __init__(self) -> None:
         super().__init__()
@@ -126,6 +132,7 @@ def test_page_lists_facts_gaps_and_notes(page):
     assert "2 rows could not be read, µ" in page.text
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_text_of_the_user_is_escaped(tmp_path):
     product = synthetic.product(windows=6, axes="x")
     product.attrs["notes"] = ["<script>alert(1)</script> & more"]
@@ -156,6 +163,7 @@ def test_existing_report_and_wrong_input_are_refused(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_product_of_an_earlier_version_has_a_report(tmp_path):
     old = synthetic.product(axes="x").drop_vars(["window_trend", "trend_response"])
     page = read(write_report(old, tmp_path / "report.html"))
