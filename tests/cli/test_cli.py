@@ -338,7 +338,13 @@ def test_an_interrupt_while_the_program_loads_is_exit_code_3(monkeypatch, capsys
 
 
 @pytest.mark.parametrize(
-    "name", ["SIGINT", "SIGTERM", pytest.param("SIGHUP", marks=pytest.mark.full)]
+    "name",
+    [
+        "SIGTERM",
+        # without a signal in `test_interrupt_is_exit_code_3`
+        pytest.param("SIGINT", marks=pytest.mark.slow),
+        pytest.param("SIGHUP", marks=pytest.mark.full),
+    ],
 )
 def test_a_real_interrupt_leaves_nothing_behind(tmp_path, name):
     path = write_log(tmp_path / "long.csv")

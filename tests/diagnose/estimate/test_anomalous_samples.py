@@ -51,7 +51,11 @@ def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -
         pytest.param(
             {"name": "dead_zone", "width": 0.2, "edge": "jump"}, {}, marks=pytest.mark.full
         ),
-        ({"name": "dead_zone", "width": 0.2, "edge": "jump", "axes": ["x"]}, {"axes": "x"}),
+        pytest.param(
+            {"name": "dead_zone", "width": 0.2, "edge": "jump", "axes": ["x"]},
+            {"axes": "x"},
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             {"name": "held_samples", "per_hour": 60.0, "length": 0.4}, {}, marks=pytest.mark.full
         ),

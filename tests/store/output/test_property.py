@@ -237,6 +237,7 @@ def kill_commands(inputs: Path, top: Path, seed: int, kills: int) -> dict[str, o
     return {"kills": landed, "wrong": wrong}
 
 
+@pytest.mark.slow  # the test above interrupts before the same calls
 def test_kills_leave_the_old_output_or_the_new_one(inputs, tmp_path):
     command = ["-m", "tests.store.output.test_property", str(inputs), str(tmp_path), "1", "4"]
     done = subprocess.run(
