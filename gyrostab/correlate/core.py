@@ -94,6 +94,8 @@ def correlate(
     >>> result = gyrostab.correlate(product, max_lag="2h")           # doctest: +SKIP
     >>> result["window_mean_per_temperature"].sel(axis="x")          # doctest: +SKIP
     """
+    from threadpoolctl import threadpool_limits
+
     product = with_axis(product)
     check_product(product)
     _check_windows(product)
@@ -130,24 +132,26 @@ def correlate(
         )
 
     entries: dict[tuple[int, int, int], dict[str, Any]] = {}
-    for d, driver in enumerate(drivers):
-        used = replace(driver, values=driver.values[: counts[d]])
-        lag_times = lags[: counts[d]].astype(np.float64) * step
-        groups: dict[tuple[bytes, bytes], list[tuple[int, int]]] = {}
-        for place, row in series.items():
-            mask = np.isfinite(row) & known[d]
-            groups.setdefault((mask.tobytes(), coverage[place[0]].tobytes()), []).append(place)
-        for key, places in groups.items():
-            rows = np.stack([series[place] for place in places])
-            fitted = fit_driver(find_blocks(*key), rows, used, other_series, lag_times, level)
-            entries |= {(*place, d): entry for place, entry in zip(places, fitted, strict=True)}
-    if len(channels) > 1:
-        _note_empty_drivers(drivers)
-        for (a, v), row in series.items():
-            of_series = [entries[a, v, d] for d in range(len(drivers))]
-            shared = known[["best" in entry for entry in of_series]].all(axis=0)
-            blocks = find_blocks((np.isfinite(row) & shared).tobytes(), coverage[a].tobytes())
-            fit_partial_effects(blocks, row, drivers, of_series, level)
+    # the matrices are many and small: more threads would only wait for each other
+    with threadpool_limits(1, user_api="blas"):
+        for d, driver in enumerate(drivers):
+            used = replace(driver, values=driver.values[: counts[d]])
+            lag_times = lags[: counts[d]].astype(np.float64) * step
+            groups: dict[tuple[bytes, bytes], list[tuple[int, int]]] = {}
+            for place, row in series.items():
+                mask = np.isfinite(row) & known[d]
+                groups.setdefault((mask.tobytes(), coverage[place[0]].tobytes()), []).append(place)
+            for key, places in groups.items():
+                rows = np.stack([series[place] for place in places])
+                fitted = fit_driver(find_blocks(*key), rows, used, other_series, lag_times, level)
+                entries |= {(*place, d): entry for place, entry in zip(places, fitted, strict=True)}
+        if len(channels) > 1:
+            _note_empty_drivers(drivers)
+            for (a, v), row in series.items():
+                of_series = [entries[a, v, d] for d in range(len(drivers))]
+                shared = known[["best" in entry for entry in of_series]].all(axis=0)
+                blocks = find_blocks((np.isfinite(row) & shared).tobytes(), coverage[a].tobytes())
+                fit_partial_effects(blocks, row, drivers, of_series, level)
     _adjust_p_values(entries)
     for (a, v, d), entry in entries.items():
         entry["unit_label"] = slope_label(product[names[v]], drivers[d].units)

@@ -11,10 +11,12 @@ import cf_units
 import numpy as np
 import pytest
 import xarray as xr
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import gyrostab
 from gyrostab.cli import main
 from gyrostab.correlate.dataset import join
+from gyrostab.correlate.fit import fit_driver
 from gyrostab.correlate.judge import VERDICTS, format_correlation
 from gyrostab.errors import MissingUnitError, OptionError, TimeError, UnitError
 from gyrostab.kernels.regression.coupling import (
@@ -52,6 +54,20 @@ def test_slope_and_lag_are_found_and_other_axes_show_no_coupling():
         correlation["coupling_verdict"].sel(axis=["y", "z"]) == VERDICTS.index("none_seen")
     ).all()
     assert "follows temperature" in str(correlation["statement"].sel(place).values)
+
+
+def test_small_matrices_are_solved_by_one_thread(monkeypatch):
+    counts = []
+
+    def fit(*arguments):
+        counts.extend(pool["num_threads"] for pool in threadpool_info() if "blas" in pool.values())
+        return fit_driver(*arguments)
+
+    monkeypatch.setattr(sys.modules["gyrostab.correlate.core"], "fit_driver", fit)
+    with threadpool_limits(2, user_api="blas"):
+        gyrostab.correlate(coupled.product(slope=0.3, noises="white"), max_lag=0)
+    assert counts
+    assert set(counts) == {1}
 
 
 def test_statement_and_table_give_the_units_of_the_coefficients():
