@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -75,9 +75,9 @@ def undo_noise_loss(
 
 
 def fit_white_noise(
-    tables: Mapping[str, Any], baseline: xr.Dataset, blocks: xr.Dataset
+    tables: Mapping[str, Any], baseline: xr.Dataset, blocks: xr.Dataset, axes: Collection[str]
 ) -> dict[str, float]:
-    """Return N of each recalibrated axis [degree hour-1/2] with the effects at their final sizes.
+    """Return N of some recalibrated axes [degree hour-1/2] with the effects at their final sizes.
 
     The noise was calibrated with sizes that are free. The final ones, averaged over lags and noise,
     add another power, as would noise that is referred to a temperature far from the recorded ones.
@@ -91,8 +91,8 @@ def fit_white_noise(
         ``quiet``.
     """
     model = read_model(dict(tables))
-    axes = [str(axis) for axis in blocks["axis"].values]
-    coefficients = [model.coefficients(axis) for axis in axes]
+    all_axes = [str(axis) for axis in blocks["axis"].values]
+    coefficients = [model.coefficients(axis) for axis in all_axes]
     square = np.array([[of_axis[term] ** 2 for term in NOISE] for of_axis in coefficients])
     white = NOISE.index("N")
     others = square.copy()
@@ -101,9 +101,8 @@ def fit_white_noise(
         expect_known_effects(blocks, model, part).spectrum for part in (square, others)
     )
     out = {}
-    for row, axis in enumerate(axes):
-        if axis not in baseline.attrs["recalibrated"]:
-            continue
+    for axis in axes:
+        row = all_axes.index(axis)
         chosen = baseline["quiet"].values[row]
         noise = spectrum[row] - added[row]
         fitted = fit_noise_factor(blocks.isel(axis=[row]), noise, added[row], chosen)

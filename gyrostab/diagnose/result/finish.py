@@ -99,7 +99,7 @@ def finish_diagnosis(
     diagnosis = Diagnosis(
         plain(content),
         _make_surfaces_with_outliers(blocks, fit, before, after),
-        model_tables(fit.noise, fit.fitted, given_model, blocks, turning),
+        model_tables(fit.noise, fit.fitted, given_model, blocks, turning, settings=task.settings),
     )
     check_diagnosis(diagnosis.content)
     return diagnosis

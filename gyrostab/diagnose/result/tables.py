@@ -27,6 +27,7 @@ from gyrostab.diagnose.result.families import find_families
 from gyrostab.diagnose.result.text import effect_statement, span_text, unsized_statement
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 from gyrostab.noise import LAWS
 from gyrostab.physics.sampling import FAST_INSTRUMENT_SAMPLES
 from gyrostab.simulate.model import Model
@@ -181,6 +182,8 @@ def model_tables(
     own: Model | None,
     blocks: xr.Dataset,
     turning: str = "",
+    *,
+    settings: Settings = DEFAULTS,
 ) -> dict[str, Any]:
     """Return the tables of the model with the effects added.
 
@@ -219,7 +222,15 @@ def model_tables(
         "bias": {axis: float(f"{rate:.6g}") for axis, rate in rates.items()},
         "effect": [effect_table(effect) for effect in [*given_effects, *added_effects]],
     }
-    if baseline.attrs.get("recalibrated"):
-        for axis, size in fit_white_noise(tables, baseline, blocks).items():
+    components = [component for effect_fit in fitted for component in effect_fit.components]
+    with_power = {  # whose noise was calibrated together with the sizes of effects
+        axis
+        for component in components
+        if component.statistic.is_power or component.statistic.is_pairwise
+        for axis in component.row
+    }.intersection(baseline.attrs.get("recalibrated", ()))
+    if with_power:
+        clean = mask_anomalous_blocks(blocks, components, settings)
+        for axis, size in fit_white_noise(tables, baseline, clean, with_power).items():
             tables["noise"][axis]["N"] = float(f"{size:.6g}")
     return tables

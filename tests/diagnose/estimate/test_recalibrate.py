@@ -174,9 +174,9 @@ def test_white_noise_of_a_model_gives_the_power_of_the_record_with_its_effects()
     table = {"name": "temperature_noise", "linear": 0.03, "axes": ["x"]}
     blocks = reduce_simulation(table, environment=[heat], lost=0.2)
     wrong = {axis: NOISE | {"N": 0.0036} for axis in "xy"}
-    baseline = calibrate_noise(blocks).assign_attrs(recalibrated=["x"])
+    baseline = calibrate_noise(blocks)
     baseline["quiet"][:] = True
-    white = fit_white_noise({"noise": wrong, "effect": [table]}, baseline, blocks)
+    white = fit_white_noise({"noise": wrong, "effect": [table]}, baseline, blocks, ["x"])
     assert white == pytest.approx({"x": 0.003}, rel=0.02)
 
 
