@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,19 +17,29 @@ MAX_CHANCE = 0.05
 MAX_UNRELATED_LINES = 3
 #: Family of the lines of a shaped spectrum.
 UNRELATED = "lines without a common spacing"
-_MAX_LOWEST_HARMONIC = 4  # the lowest line of a family may be this multiple of the fundamental
+#: Largest multiple of the spacing that defines a family: of its lowest line, or between two lines.
+_MAX_LOWEST_HARMONIC = 4
+_MAX_APART = 3  # places between two lines that define a spacing; limits time
+_MAX_DOUBT = 0.25  # of a spacing, about a multiple: half of the distance to the next at both sides
+
+
+class _Spacing(NamedTuple):
+    """Distance of the lines of a family, and its error [Hz]."""
+
+    size: float
+    error: float
 
 
 def find_families(
-    frequencies: Sequence[float], *, resolution: float, bandwidth: float
+    frequencies: Sequence[float], *, resolution: float | Sequence[float], bandwidth: float
 ) -> list[str | None]:
     """Label the family of each line; None for a line without one.
 
     Lines at multiples of a spacing, counted from zero or from another line, are a family if the
     probability is below 5 % that as many unrelated lines fall there, over all spacings and centres
     that are tried. The least probable family is taken first. More than three lines without a family
-    are one too. The resolution is the distance of two lines of the spectrum, the bandwidth half the
-    sampling rate [Hz].
+    are one too. The resolution, of all lines or of each, is the largest distance from such a
+    multiple, and the bandwidth half the sampling rate [Hz].
 
     Examples
     --------
@@ -38,12 +48,16 @@ def find_families(
     >>> find_families([10.0, 10.7, 9.3], resolution=0.05, bandwidth=50.0)[0]
     'side bands of 10 Hz, 0.7 Hz apart'
     """
-    lines, places = np.unique(np.asarray(frequencies, dtype=np.float64), return_inverse=True)
+    lines, first, places = np.unique(
+        np.asarray(frequencies, dtype=np.float64), return_index=True, return_inverse=True
+    )
+    distances = np.broadcast_to(np.asarray(resolution, dtype=np.float64), places.shape)[first]
     labels: dict[int, str] = {}
     remaining = np.arange(lines.size)
     while remaining.size > 1:
         chance, label, members = min(
-            _try_families(lines[remaining], resolution, bandwidth), key=lambda family: family[0]
+            _try_families(lines[remaining], distances[remaining], bandwidth),
+            key=lambda family: family[0],
         )
         if chance > MAX_CHANCE:
             break
@@ -55,45 +69,83 @@ def find_families(
 
 
 def _try_families(
-    lines: Array, resolution: float, bandwidth: float
+    lines: Array, resolution: Array, bandwidth: float
 ) -> Iterator[tuple[float, str, list[int]]]:
     """Yield the probability by chance, the label and the members of each possible family."""
-    for centre in (0.0, *lines):
-        lowest, highest = (1, 1.0) if centre else (_MAX_LOWEST_HARMONIC, np.inf)
-        for line in lines[lines != centre]:
-            for order in range(1, lowest + 1):
-                spacing, members = _collect_multiples(
-                    lines - centre, abs(line - centre) / order, highest, resolution
-                )
-                share = 2.0 * resolution * min(1.0 / spacing, 2.0 * highest / bandwidth)
-                defining_count = 2 if centre else 1  # lines that define the family
-                tried = math.comb(lines.size, defining_count) * order**2
-                chance = bdtrc(
-                    len(members) - defining_count - 1, lines.size - defining_count, min(share, 1.0)
-                )
-                label = (
-                    f"side bands of {centre:.4g} Hz, {spacing:.4g} Hz apart"
-                    if centre
-                    else f"harmonics of {spacing:.4g} Hz"
-                )
-                yield tried * float(chance), label, members
+    for first, error in zip(lines, resolution, strict=True):  # a low multiple
+        for order in range(1, _MAX_LOWEST_HARMONIC + 1):
+            start = _Spacing(first / order, error / order)
+            yield _judge_family(lines, resolution, start, tried=lines.size * order**2, defining=1)
+    for apart in range(1, _MAX_APART + 1):  # two neighbouring multiples
+        errors = np.hypot(resolution[apart:], resolution[:-apart])
+        for difference, error in zip(lines[apart:] - lines[:-apart], errors, strict=True):
+            for order in range(1, _MAX_LOWEST_HARMONIC + 1):
+                start = _Spacing(difference / order, error / order)
+                tried = math.comb(lines.size, 2) * order**2
+                yield _judge_family(lines, resolution, start, tried=tried, defining=2)
+    for place, centre in enumerate(lines):
+        errors = np.maximum(resolution, resolution[place])
+        for line in np.flatnonzero(lines != centre):
+            start = _Spacing(abs(float(lines[line] - centre)), float(errors[line]))
+            tried = math.comb(lines.size, 2)
+            yield _judge_family(
+                lines, errors, start, tried=tried, defining=2, centre=centre, bandwidth=bandwidth
+            )
 
 
-def _collect_multiples(
-    distance: Array, spacing: float, highest: float, resolution: float
-) -> tuple[float, list[int]]:
-    """Return a refined spacing, and the lines at multiples of it, the nearest ones first."""
-    members: list[int] = []
-    orders: list[float] = []
+def _judge_family(
+    lines: Array,
+    resolution: Array,
+    start: _Spacing,
+    *,
+    tried: int,
+    defining: int,
+    centre: float = 0.0,
+    bandwidth: float = math.inf,
+) -> tuple[float, str, list[int]]:
+    """Return the probability by chance, the label and the members of a family from its spacing.
+
+    It is one of so many that were `tried`, and `defining` lines determine it. The shares of the
+    lines that unrelated ones fall on are replaced by their mean, which does not lower the
+    probability of many (Hoeffding 1956, doi:10.1214/aoms/1177728178).
+    """
+    distance, highest = lines - centre, 1.0 if centre else math.inf
+    spacing, error = _refine_spacing(distance, resolution, start, highest)
+    order = np.rint(distance / spacing)
+    allowed = resolution if centre else np.hypot(resolution, order * error)
+    is_near = np.abs(distance - order * spacing) <= np.minimum(allowed, _MAX_DOUBT * spacing)
+    is_multiple = (np.abs(order) <= highest) & ((order != 0.0) | (distance == 0.0))
+    members = np.flatnonzero(is_near & is_multiple).tolist()
+    place = min(1.0 / spacing, 2.0 * highest / bandwidth) if centre else 1.0 / spacing
+    share = float(np.minimum(2.0 * allowed * place, 1.0).mean())
+    chance = bdtrc(len(members) - defining - 1, lines.size - defining, share)
+    label = (
+        f"side bands of {centre:.4g} Hz, {spacing:.4g} Hz apart"
+        if centre
+        else f"harmonics of {spacing:.4g} Hz"
+    )
+    return tried * float(chance), label, members
+
+
+def _refine_spacing(
+    distance: Array, resolution: Array, start: _Spacing, highest: float
+) -> _Spacing:
+    """Return the spacing of the lines at multiples of it, the nearest ones first.
+
+    A line whose multiple is not certain, because it or the spacing is not known well enough, does
+    not count.
+    """
+    spacing, error = start
+    products, squares = spacing / error**2, 1.0 / error**2
     for line in np.argsort(np.abs(distance)).tolist():
         order = float(np.rint(distance[line] / spacing))
-        is_near = abs(distance[line] - order * spacing) <= resolution and abs(order) <= highest
-        if is_near and (order or not distance[line]):
-            members.append(line)
-            orders.append(order)
-            if any(orders):
-                spacing = float(np.dot(orders, distance[members]) / np.dot(orders, orders))
-    return spacing, members
+        allowed = math.hypot(resolution[line], order * error)
+        is_near = abs(distance[line] - order * spacing) <= allowed <= _MAX_DOUBT * spacing
+        if is_near and 0.0 < abs(order) <= highest:
+            products += order * distance[line] / resolution[line] ** 2
+            squares += order**2 / resolution[line] ** 2
+            spacing, error = float(products / squares), float(squares**-0.5)
+    return _Spacing(spacing, error)
 
 
 def group_families(effects: Sequence[Mapping[str, Any]]) -> list[list[Mapping[str, Any]]]:

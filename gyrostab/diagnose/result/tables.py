@@ -156,10 +156,10 @@ def _families_of(fitted: Sequence[Fitted], blocks: xr.Dataset) -> list[str | Non
     ]
     families: list[str | None] = [None] * len(fitted)
     if len(lines) > 1:
-        frequencies = [fitted[number].parameters["frequency"].value for number in lines]
+        frequencies = [fitted[number].parameters["frequency"] for number in lines]
         labels = find_families(
-            frequencies,
-            resolution=float(np.diff(blocks["line_frequency"].values[:2])[0]),
+            [frequency.value for frequency in frequencies],
+            resolution=[2.0 * frequency.stderr for frequency in frequencies],
             bandwidth=0.5 * float(blocks.attrs["sampling_rate_hz"]),
         )
         for number, family in zip(lines, labels, strict=True):

@@ -26,6 +26,30 @@ def test_harmonics_are_one_family_also_without_the_fundamental(missing: int):
     assert families[comb.size :] == [None] * 3
 
 
+def test_precise_lines_are_harmonics_of_a_spacing_that_the_lowest_do_not_show():
+    """Steady lines are known to 1e-3 of the distance of lines, in which the fundamental is lost."""
+    rng = np.random.default_rng(3)
+    orders = np.array([7, 9, 15, 25, 31, 33, 41, 49, 55, 63, 71, 95, 113])
+    error = np.where(orders < 10, 0.025, 3e-4)
+    comb = 0.18690 * orders + error * rng.uniform(-1.0, 1.0, orders.size)
+    others = [7.347, 11.539, 13.752, 15.392, 16.766]
+    families = find_families(
+        [*comb, *others], resolution=[*(2.0 * error), *[6e-4] * 5], bandwidth=50.0
+    )
+    assert set(families[2:13]) == {"harmonics of 0.1869 Hz"}
+    assert set(families[13:]) == {UNRELATED}
+
+
+def test_unrelated_precise_lines_are_rarely_a_family():
+    rng = np.random.default_rng(4)
+    wrong = 0
+    for _ in range(100):
+        resolution = rng.choice([6e-4, 0.05], 8)
+        families = find_families(rng.uniform(0.1, 50.0, 8), resolution=resolution, bandwidth=50.0)
+        wrong += set(families) != {UNRELATED}
+    assert wrong <= 100 * MAX_CHANCE
+
+
 def test_side_bands_belong_to_their_line():
     families = find_families([20.01, 18.76, 21.26, 33.9], **SPECTRUM)
     assert families == ["side bands of 20.01 Hz, 1.25 Hz apart"] * 3 + [None]
