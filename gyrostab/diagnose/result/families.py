@@ -109,16 +109,11 @@ def _judge_family(
     lines that unrelated ones fall on are replaced by their mean, which does not lower the
     probability of many (Hoeffding 1956, doi:10.1214/aoms/1177728178).
     """
-    distance, highest = lines - centre, 1.0 if centre else math.inf
-    spacing, error = _refine_spacing(distance, resolution, start, highest)
-    order = np.rint(distance / spacing)
-    allowed = resolution if centre else np.hypot(resolution, order * error)
-    is_near = np.abs(distance - order * spacing) <= np.minimum(allowed, _MAX_DOUBT * spacing)
-    is_multiple = (np.abs(order) <= highest) & ((order != 0.0) | (distance == 0.0))
-    members = np.flatnonzero(is_near & is_multiple).tolist()
+    highest = 1.0 if centre else math.inf
+    spacing, members, allowed = _collect_multiples(lines - centre, resolution, start, highest)
     place = min(1.0 / spacing, 2.0 * highest / bandwidth) if centre else 1.0 / spacing
-    share = float(np.minimum(2.0 * allowed * place, 1.0).mean())
-    chance = bdtrc(len(members) - defining - 1, lines.size - defining, share)
+    share = min(2.0 * float(np.mean(allowed)) * place, 1.0) if allowed else 1.0
+    chance = bdtrc(len(members) - defining - 1, len(allowed) - defining, share)
     label = (
         f"side bands of {centre:.4g} Hz, {spacing:.4g} Hz apart"
         if centre
@@ -127,25 +122,33 @@ def _judge_family(
     return tried * float(chance), label, members
 
 
-def _refine_spacing(
+def _collect_multiples(
     distance: Array, resolution: Array, start: _Spacing, highest: float
-) -> _Spacing:
-    """Return the spacing of the lines at multiples of it, the nearest ones first.
+) -> tuple[float, list[int], list[float]]:
+    """Return a refined spacing, the lines at multiples of it, and what was allowed for each line.
 
-    A line whose multiple is not certain, because it or the spacing is not known well enough, does
-    not count.
+    The nearest lines come first, and each one at a multiple makes the spacing of the next more
+    exact. A line whose multiple is not certain, because it or the spacing is not known well enough,
+    does not count. The distance allowed is that before the line itself changes the spacing.
     """
+    members: list[int] = []
+    allowances: list[float] = []
     spacing, error = start
     products, squares = spacing / error**2, 1.0 / error**2
     for line in np.argsort(np.abs(distance)).tolist():
         order = float(np.rint(distance[line] / spacing))
-        allowed = math.hypot(resolution[line], order * error)
-        is_near = abs(distance[line] - order * spacing) <= allowed <= _MAX_DOUBT * spacing
-        if is_near and 0.0 < abs(order) <= highest:
+        # the two side bands next to a line are as far from it
+        allowed = math.hypot(resolution[line], order * error if highest > 1.0 else 0.0)
+        if allowed > _MAX_DOUBT * spacing:
+            continue
+        allowances.append(allowed)
+        is_near = abs(distance[line] - order * spacing) <= allowed and abs(order) <= highest
+        if is_near and (order or not distance[line]):
+            members.append(line)
             products += order * distance[line] / resolution[line] ** 2
             squares += order**2 / resolution[line] ** 2
             spacing, error = float(products / squares), float(squares**-0.5)
-    return _Spacing(spacing, error)
+    return spacing, members, allowances
 
 
 def group_families(effects: Sequence[Mapping[str, Any]]) -> list[list[Mapping[str, Any]]]:
