@@ -46,10 +46,8 @@ class TurningAngle:
         self.counters = [] if count is None else [size * abs(count) for size in _COUNTERS]
         self.last: tuple[float, int] | None = None  # angle as it is written [degree], stamp [ns]
         self.low, self.high = np.inf, -np.inf
-        self.period, self.usual = (
-            np.inf,
-            0.0,
-        )  # infinite without a turn; largest usual step [degree]
+        self.period = np.inf  # [degree]; infinite without a turn
+        self.usual = 0.0  # largest usual step [degree]
         self.first = 0  # row of the next block
         #: Rows from which on angles [degree] are added, and rows of jumps that are not explained.
         self.rows: list[int] = []
