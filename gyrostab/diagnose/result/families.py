@@ -20,7 +20,9 @@ UNRELATED = "lines without a common spacing"
 #: Largest multiple of the spacing that defines a family: of its lowest line, or between two lines.
 _MAX_LOWEST_HARMONIC = 4
 _MAX_APART = 3  # places between two lines that define a spacing; limits time
-_MAX_DOUBT = 0.25  # of a spacing, about a multiple: half of the distance to the next at both sides
+#: Distance allowed about a multiple, in spacings; with more, most unrelated lines are at one. Design
+#: choice: the chance of a family accounts for what is allowed.
+_MAX_DOUBT = 0.25
 
 
 class _Spacing(NamedTuple):
@@ -137,7 +139,7 @@ def _collect_multiples(
     products, squares = spacing / error**2, 1.0 / error**2
     for line in np.argsort(np.abs(distance)).tolist():
         order = float(np.rint(distance[line] / spacing))
-        # the two side bands next to a line are as far from it
+        # side bands next to a line are compared with each other, not with a refined spacing
         allowed = math.hypot(resolution[line], order * error if highest > 1.0 else 0.0)
         if allowed > _MAX_DOUBT * spacing:
             continue
