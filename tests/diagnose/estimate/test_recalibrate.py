@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import assemble_baseline, calibrate_axes, calibrate_noise
+from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.constant_rate import fit_white_noise
 from gyrostab.diagnose.estimate.forms import settle_forms
@@ -213,6 +214,25 @@ def test_noise_does_not_wander_as_the_effect_does():
     assert noise_coefficient(baseline, "K")[0] > 1.0
     assert noise_coefficient(after, "K")[0] < 0.3
     assert noise_coefficient(after, "B")[0] < 0.05
+
+
+@pytest.mark.parametrize("factor", [0.85, 0.95, 1.0])
+def test_model_has_the_power_of_the_record_at_any_size_of_the_effect(shaken, factor):
+    identifications, baseline, _ = shaken
+    blocks = identifications.state.blocks
+    first = fit_identifications(identifications, baseline)
+    fit = conclude.refit_with_noise(identifications, baseline, first)
+    (fitted,) = fit.fitted
+    changed = replace(fitted, effect=replace(fitted.effect, white=factor * fitted.effect.white))
+    tables = conclude.model_tables(fit.noise, [changed], None, blocks)
+    expected, noise = (
+        baseline_from_model(blocks, model)["spectrum"].sel(axis="x")
+        for model in (tables, tables | {"effect": []})
+    )
+    x = blocks.sel(axis="x")
+    ratio = (x["power"] / expected).weighted(x["shape"] * noise / expected)
+    assert float(ratio.mean()) == pytest.approx(1.0, abs=0.02)
+    assert tables["noise"]["y"]["N"] == pytest.approx(noise_coefficient(baseline, "N", "y")[0])
 
 
 def test_axis_without_an_effect_keeps_its_noise(shaken):
