@@ -20,8 +20,8 @@ UNRELATED = "lines without a common spacing"
 #: Largest multiple of the spacing that defines a family: of its lowest line, or between two lines.
 _MAX_LOWEST_HARMONIC = 4
 _MAX_APART = 3  # places between two lines that define a spacing; limits time
-#: Distance allowed about a multiple, in spacings; with more, most unrelated lines are at one. Design
-#: choice: the chance of a family accounts for what is allowed.
+#: Distance allowed about a multiple, in spacings; with more, most unrelated lines are at one.
+#: Design choice: the chance of a family accounts for what is allowed.
 _MAX_DOUBT = 0.25
 
 
