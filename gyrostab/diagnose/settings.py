@@ -228,8 +228,9 @@ class Settings:
     max_moving_share: float = _make_setting(
         2.0 / 3.0,
         "1",
-        "Largest share of the blocks that an axis may move.",
-        "choice: the level at rest is that of the closest quarter of the means; a third is safe",
+        "Largest share of the blocks that an axis may move if its level at rest is that of the "
+        "closest quarter of the means; otherwise it is that of the steadiest stretch.",
+        "choice: a third at rest contains the quarter",
     )
     motion_margin_blocks: int = _make_setting(
         2,

@@ -226,13 +226,20 @@ def visible_coefficients(density: float, span: float) -> tuple[float, float]:
     return float(np.sqrt(HOUR * 3.0 * density) / span), float(np.sqrt(density / span / 0.44))
 
 
-def fine_grid(density: float, span: float, step: float) -> tuple[Array, Array]:
-    """Return values of K and B, from invisible in the means to far above white noise."""
+def fine_grid(
+    density: float, span: float, step: float, *, of_powers: tuple[float, float] = (0.0, 0.0)
+) -> tuple[Array, Array]:
+    """Return values of K and B, from invisible in the means to far above white noise.
+
+    They reach three times the values `of_powers` (K, B), however large these are.
+    """
     K, B = visible_coefficients(density, span)
-    top = 300.0 * span / step
+    ratio = 300.0 * span / step
+    K_ratio = max(ratio, 30.0 * of_powers[0] / K)
+    B_ratio = max(30.0 * np.sqrt(ratio), 30.0 * of_powers[1] / B)
     return (
-        np.geomspace(0.1 * K, 0.1 * K * top, round(6.0 * np.log10(top))),
-        np.geomspace(0.1 * B, 3.0 * B * np.sqrt(top), round(4.0 * np.log10(30.0 * np.sqrt(top)))),
+        np.geomspace(0.1 * K, 0.1 * K * K_ratio, round(6.0 * np.log10(K_ratio))),
+        np.geomspace(0.1 * B, 0.1 * B * B_ratio, round(4.0 * np.log10(B_ratio))),
     )
 
 
@@ -285,6 +292,18 @@ def _draw_near(mean: Array, covariance: Array, rng: np.random.Generator) -> Arra
     return np.stack([Q, N], axis=1)
 
 
+def _draw_positive(square: Array, information: Array, rng: np.random.Generator) -> Array:
+    """Draw squares (draw, 4) about a fit, with the covariance of those that are not zero."""
+    is_positive = square > 0.0
+    scale = square[is_positive]
+    relative = information[np.ix_(is_positive, is_positive)] * np.outer(scale, scale)
+    draws = np.zeros((DRAWS, square.size))
+    draws[:, is_positive] = scale * rng.multivariate_normal(
+        np.ones(scale.size), np.linalg.pinv(relative), DRAWS, method="eigh"
+    )
+    return np.maximum(draws, 0.0)
+
+
 def noise_posterior(
     fit: Fit,
     blocks: xr.Dataset,
@@ -314,7 +333,10 @@ def noise_posterior(
     present, rng = use & np.isfinite(mean), np.random.default_rng(row)
     square, information, spectrum = fit_squares(fit)
     density = HOUR * float(with_floor(square, fit)[1])
-    coarse_K, coarse_B = fine_grid(density, mean.size * step, step)
+    B_of_powers, K_of_powers = np.sqrt(square[2:])
+    coarse_K, coarse_B = fine_grid(
+        density, mean.size * step, step, of_powers=(K_of_powers, B_of_powers)
+    )
     K, B = (axis_values.ravel() for axis_values in np.meshgrid(coarse_K, coarse_B, indexing="ij"))
     means = AxisMeans(
         np.where(present, mean, 0.0)[:, None],
@@ -344,7 +366,7 @@ def noise_posterior(
         spread = np.asarray(np.linalg.inv(normal), np.float64)
         squares = np.concatenate([_draw_near(best[cell], spread, rng), slow_draws], axis=1)
     else:
-        squares = np.maximum(square + error * rng.standard_normal((DRAWS, 4)), 0.0)
+        squares = _draw_positive(square, information, rng)
     squares[:, 1] = np.maximum(squares[:, 1], 0.01 * square[1])
     return Posterior(
         square,

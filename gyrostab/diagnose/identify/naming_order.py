@@ -48,14 +48,36 @@ def order_passing(
         counts
         or confirmed
         or switching
-        or _without_slopes(
-            _without_locked_lines(passing, components, state),
+        or _on_other_axes(
+            _without_slopes(
+                _without_locked_lines(passing, components, state),
+                components,
+                state,
+                examination,
+            ),
             components,
-            state,
-            examination,
         )
     )
     return put_followers_first(first, components, state)
+
+
+def _on_other_axes(passing: list[str], components: Mapping[str, Sequence[Component]]) -> list[str]:
+    """Return the effects on whose axes no nuisance alternative explains more; all without any.
+
+    An axis that moves, for instance, has much that no effect explains. What another axis senses of
+    it by its misalignment does not compete with that.
+    """
+    if not passing or not passing[0].startswith("~"):
+        return passing
+    unexplained_axes: set[str] = set()
+    elsewhere = []
+    for key in passing:
+        axes = {axis for component in components[key] for axis in component.row}
+        if key.startswith("~"):
+            unexplained_axes |= axes
+        elif not axes & unexplained_axes:
+            elsewhere.append(key)
+    return elsewhere or passing
 
 
 def order_rivals(

@@ -215,6 +215,8 @@ def _select_next(
                 beaten[key] = better_form
             else:
                 beaten.pop(key, None)
+                # without the axes of impossible sizes
+                required[key] = examination.required_nats(components[key], chosen)
     passing = order_passing(components, required, state, examination)
     if not passing:
         return None

@@ -51,14 +51,30 @@ def sample_range(blocks: xr.Dataset) -> float:
 
 
 def moving_blocks_of_axis(mean: Array, span: float, settings: Settings) -> NDArray[np.bool_]:
-    """Find the moving blocks of one axis of a record whose samples have the range `span`."""
+    """Find the moving blocks of one axis of a record whose samples have the range `span`.
+
+    The level at rest is where a quarter of the means lie closest together, if a third of the record
+    is at rest. Otherwise it is that of the steadiest stretch; a random walk has one by chance in 1
+    of 300 records of 4000 blocks, and in none of 5000 shorter ones.
+    """
+    good = np.isfinite(mean)
+    if good.sum() < settings.min_rest_blocks:
+        return np.zeros(mean.size, np.bool_)
+    min_blocks = max(settings.min_rest_blocks, (1.0 - settings.max_moving_share) * good.sum())
+    moving = _find_motion(mean, _closest_quarter(mean[good]), min_blocks, span, settings)
+    if moving.any():
+        return moving
+    steadiest = _steadiest_stretch(mean[good], settings.min_rest_blocks)
+    return _find_motion(mean, steadiest, settings.min_rest_blocks, span, settings)
+
+
+def _find_motion(
+    mean: Array, rest: tuple[float, float], min_blocks: float, span: float, settings: Settings
+) -> NDArray[np.bool_]:
+    """Find the blocks that move away from rest (centre, scatter); none if too few are at rest."""
     good = np.isfinite(mean)
     nothing = np.zeros(mean.size, np.bool_)
-    min_blocks = max(settings.min_rest_blocks, (1.0 - settings.max_moving_share) * good.sum())
-    if good.sum() < min_blocks:
-        return nothing
-    centre, scale = _find_rest_level(mean[good])
-    scale = _without_zero(scale, span)
+    centre, scale = rest[0], _without_zero(rest[1], span)
     away = np.abs(mean - centre)
     is_at_rest = good & (away <= settings.rest_sigma * scale)
     for _ in range(REST_ROUNDS):
@@ -91,8 +107,15 @@ def _without_zero(scale: float, span: float) -> float:
     return scale if scale > ROUNDING * span else EQUAL_SCATTER * span
 
 
-def _find_rest_level(mean: Array) -> tuple[float, float]:
-    """Return centre and scatter of the means where they lie closest together: the level at rest."""
+def _steadiest_stretch(mean: Array, size: int) -> tuple[float, float]:
+    """Return centre and scatter of the consecutive means that scatter least."""
+    stretches = np.lib.stride_tricks.sliding_window_view(mean, size)
+    steadiest = stretches[stretches.std(axis=1).argmin()]
+    return float(np.median(steadiest)), float(steadiest.std(ddof=1))
+
+
+def _closest_quarter(mean: Array) -> tuple[float, float]:
+    """Return centre and scatter of the quarter of the means that lie closest together."""
     ordered = np.sort(mean)
     size = int(np.ceil(CORE_SHARE * mean.size))
     width = ordered[size - 1 :] - ordered[: mean.size - size + 1]

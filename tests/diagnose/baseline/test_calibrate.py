@@ -397,6 +397,19 @@ def test_equal_means_have_no_angle_noise():
         assert means.with_angle_noise(K, B, means.log_likelihood(K, B), 3.0) is means
 
 
+@pytest.mark.parametrize("rest", first_of(0.0, 200.0))
+def test_null_powers_are_those_expected_of_an_axis_that_moves(rest):
+    """Its motion is no noise of one law, or a random walk beyond any that its means allow."""
+    quiet_log = log({"N": 0.003, "K": 0.02})
+    seconds = np.arange(quiet_log.sizes["time"]) / quiet_log.attrs["sampling_rate_hz"]
+    motion = 2000.0 * np.sin(seconds / 70.0) ** 3 * (seconds > rest)
+    moved = quiet_log.assign(rate=quiet_log["rate"] + xr.DataArray(motion, dims="time"))
+    baseline = calibrate_noise(reduce_log(moved))
+    assert baseline.attrs["slow_noise_apart"] == list(baseline["axis"].values)
+    drawn = baseline["columns"].dot(baseline["posterior"].mean("draw"), dim="noise")
+    np.testing.assert_allclose(drawn / baseline["spectrum"], 1.0, atol=0.1)
+
+
 def test_null_means_have_the_noise_of_means_where_it_is_apart():
     """Draws of the noise of the powers, four times as strong, do not change the means."""
     blocks = reduce_log(log({"N": 0.003}))

@@ -148,6 +148,25 @@ def test_tails_of_blocks_in_which_an_axis_turns_do_not_count():
     assert evidence[1] < 3.0
 
 
+def test_axis_that_turns_without_a_channel_leaks_into_another():
+    """What nothing explains on the axis that turns does not hide the misalignment of another."""
+    log = simulate(
+        {"log": {"axes": ["x", "y", "z"]}, "noise": {"N": 0.005}},
+        duration="20min",
+        rate=10.0,
+        seed=5,
+    )
+    seconds = np.arange(log.sizes["time"]) / 10.0
+    turns = 2000.0 * np.sin(seconds / 70.0) ** 3 * (seconds > 240.0)
+    share = xr.DataArray([2e-4, 0.0, 1.0], {"axis": log["axis"]})
+    blocks = reduce_log(log.assign(rate=log["rate"] + share * xr.DataArray(turns, dims="time")))
+    baseline, records = nulls(blocks, 40)
+    identifications = name_effects(blocks, baseline, records)
+    at_rest = [other for other in identifications.identified if set(other.axes) & {"x", "y"}]
+    assert [(other.effect, other.axes) for other in at_rest] == [("misalignment", ("x",))]
+    assert {axis for unknown in identifications.unknown for axis in unknown.axes} == {"z"}
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("error", [0.0, 2e-4])
 def test_whole_rotation_is_the_only_effect(error: float):

@@ -15,8 +15,13 @@ from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.reduce.block_statistics import measured, reduce_log
-from gyrostab.diagnose.reduce.moving_blocks import moving_blocks, without_motion
+from gyrostab.diagnose.reduce.moving_blocks import (
+    moving_blocks,
+    moving_blocks_of_axis,
+    without_motion,
+)
 from gyrostab.diagnose.result.mismatch_tables import motion_mismatches
+from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.errors import SchemaError
@@ -82,12 +87,25 @@ def test_motion_is_found_where_all_means_at_rest_are_equal(share):
     assert not moving[:28].any()
 
 
-def test_axis_that_mostly_rotates_has_no_rest(turning):
-    rate = turning["rate"].transpose("axis", "time").values.copy()
-    rate[2, 3000:] += 400.0 * np.arange(rate.shape[1] - 3000) / 1000.0
-    assert not moving_blocks(
-        reduce_log(turning.assign(rate=(("axis", "time"), rate, turning["rate"].attrs)))
-    )[2].any()
+@pytest.mark.parametrize(("rest", "found"), [(800, False), (3000, True)])
+def test_axis_that_mostly_rotates_needs_a_stretch_at_rest(at_rest, rest, found):
+    rate = at_rest["rate"].transpose("axis", "time").values.copy()
+    rate[2, rest:] += 400.0 * np.arange(rate.shape[1] - rest) / 1000.0
+    blocks = reduce_log(at_rest.assign(rate=(("axis", "time"), rate, at_rest["rate"].attrs)))
+    moving, begin = moving_blocks(blocks), blocks["begin"].values
+    assert not moving[:2].any()
+    assert moving[2].any() == found
+    if found:
+        assert moving[2, begin > 340.0].all()
+        assert not moving[2, begin < 250.0].any()
+
+
+@pytest.mark.parametrize("blocks", [100, 4000])
+def test_random_walk_is_not_motion(blocks):
+    walks = np.random.default_rng(1).standard_normal((40, blocks)).cumsum(axis=1)
+    assert not any(
+        moving_blocks_of_axis(walk, float(np.ptp(walk)), DEFAULTS).any() for walk in walks
+    )
 
 
 def test_motion_is_left_out_on_its_axis_and_kept_as_measured(reduced):
