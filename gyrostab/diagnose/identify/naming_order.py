@@ -14,6 +14,7 @@ from gyrostab.diagnose.identify.identification import form_error, make_selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on, mean_columns
 from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.statistics.spectral_line import explained_lines
 
 
 def order_passing(
@@ -110,7 +111,7 @@ def order_rivals(
 def _without_locked_lines(
     passing: list[str], components: Mapping[str, list[Component]], state: State
 ) -> list[str]:
-    """Drop lines that a passing phase-locked effect explains."""
+    """Drop lines that a passing phase-locked effect explains on all of their axes."""
     locked = [
         key
         for key in passing
@@ -119,15 +120,17 @@ def _without_locked_lines(
     lines = [key for key in passing if components[key][0].candidate.statistic.is_line]
     if not lines:
         return passing
-    masks = [
-        mask
-        for key in locked
-        for mask in condition_on(state, components[key]).given.get(("line", "all"), [])
-    ]
+    explained = np.zeros((len(state.axes), state.blocks.sizes["line"]), np.bool_)
+    for key in locked:
+        explained |= explained_lines(condition_on(state, components[key]))
     return [
         key
         for key in passing
-        if key not in lines or not any(mask[components[key][0].place] for mask in masks)
+        if key not in lines
+        or not all(
+            explained[state.axes.index(component.row[0]), component.place]
+            for component in components[key]
+        )
     ]
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.spectral_lines import (
     expected_lines,
@@ -124,9 +125,7 @@ class SpectralLine(Statistic):
         evidence_nats = line_evidence(power, trial.state.blocks["line_weight"].values, expected)
         if "record" not in trial.data["line_power"].dims and "sine_nats" in trial.data:
             evidence_nats = np.logaddexp(evidence_nats, trial.data["sine_nats"].values) - np.log(2)
-        masks = trial.state.given.get(("line", "all"), [])
-        for mask in masks:
-            evidence_nats = np.where(mask, -np.inf, evidence_nats)
+        evidence_nats = np.where(explained_lines(trial.state), -np.inf, evidence_nats)
         # (record,), one line for all axes
         place = np.maximum(evidence_nats, 0.0).sum(axis=1).argmax(axis=-1)
         best = np.take_along_axis(evidence_nats, place[:, None, None], axis=2)[..., 0]
@@ -251,6 +250,18 @@ class SpectralLine(Statistic):
             f"{region.get('frequency', np.nan):.5g} Hz {when}, at {region['ratio']:.3g} times the "
             "noise level"
         )
+
+
+def explained_lines(state: State) -> NDArray[np.bool_]:
+    """Return the lines (axis, line) that the effects in the model explain."""
+    nothing = np.zeros(state.blocks.sizes["line"], np.bool_)
+    of_all = state.given.get(("line", "all"), [])
+    return np.stack(
+        [
+            np.any([nothing, *of_all, *state.given.get(("line", axis), [])], axis=0)
+            for axis in state.axes
+        ]
+    )
 
 
 def _equal_block_share(blocks: xr.Dataset, windows: Windows) -> Array:

@@ -284,3 +284,20 @@ def test_scores_at_orders_scatter_like_null_records() -> None:
     assert noise is not None
     largest = noise["z"].max([dim for dim in noise["z"].dims if dim != "record"])
     assert float(real["z"].max()) < 2.0 * float(largest.max())
+
+
+def test_line_of_another_axis_is_named_beside_resets_of_the_ramp():
+    """The resets explain lines near multiples of the ramp frequency on their own axis only."""
+    phase = np.mod(0.72 * SECOND, 1.0)
+    rate = WHITE * np.random.default_rng(3).standard_normal((2, SECOND.size))
+    rate[0] += WHITE * (phase - 0.5)
+    rate[1] += 0.4 * WHITE * np.sin(2.0 * np.pi * 0.66 * SECOND)
+    log = make_log(rate, rate=RATE, unit="deg/h").assign(ramp=("time", phase, {"units": "1"}))
+    blocks = reduce_log(log, block="20s")
+    baseline, records = nulls(blocks, 40)
+    identified = name_effects(blocks, baseline, records).identified
+    first, second = map(str, blocks["axis"].values)
+    assert {(effect.effect, effect.axes) for effect in identified} == {
+        ("feedback_reset", (first,)),
+        ("spectral_line", (second,)),
+    }
