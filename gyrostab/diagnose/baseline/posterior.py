@@ -226,20 +226,13 @@ def visible_coefficients(density: float, span: float) -> tuple[float, float]:
     return float(np.sqrt(HOUR * 3.0 * density) / span), float(np.sqrt(density / span / 0.44))
 
 
-def fine_grid(
-    density: float, span: float, step: float, *, of_powers: tuple[float, float] = (0.0, 0.0)
-) -> tuple[Array, Array]:
-    """Return values of K and B, from invisible in the means to far above white noise.
-
-    They reach three times the values `of_powers` (K, B), however large these are.
-    """
+def fine_grid(density: float, span: float, step: float) -> tuple[Array, Array]:
+    """Return values of K and B, from invisible in the means to far above white noise."""
     K, B = visible_coefficients(density, span)
-    ratio = 300.0 * span / step
-    K_ratio = max(ratio, 30.0 * of_powers[0] / K)
-    B_ratio = max(30.0 * np.sqrt(ratio), 30.0 * of_powers[1] / B)
+    top = 300.0 * span / step
     return (
-        np.geomspace(0.1 * K, 0.1 * K * K_ratio, round(6.0 * np.log10(K_ratio))),
-        np.geomspace(0.1 * B, 0.1 * B * B_ratio, round(4.0 * np.log10(B_ratio))),
+        np.geomspace(0.1 * K, 0.1 * K * top, round(6.0 * np.log10(top))),
+        np.geomspace(0.1 * B, 3.0 * B * np.sqrt(top), round(4.0 * np.log10(30.0 * np.sqrt(top)))),
     )
 
 
@@ -293,11 +286,15 @@ def _draw_near(mean: Array, covariance: Array, rng: np.random.Generator) -> Arra
 
 
 def _draw_positive(square: Array, information: Array, rng: np.random.Generator) -> Array:
-    """Draw squares (draw, 4) about a fit, with the covariance of those that are not zero."""
+    """Draw squares (draw, 4) about a fit, with the covariance of those that are not zero.
+
+    Those that are zero have the error that they have with all others fixed, on one side.
+    """
     is_positive = square > 0.0
     scale = square[is_positive]
     relative = information[np.ix_(is_positive, is_positive)] * np.outer(scale, scale)
-    draws = np.zeros((DRAWS, square.size))
+    draws = np.abs(rng.standard_normal((DRAWS, square.size)))
+    draws /= np.sqrt(np.maximum(np.diagonal(information), np.finfo(float).tiny))
     draws[:, is_positive] = scale * rng.multivariate_normal(
         np.ones(scale.size), np.linalg.pinv(relative), DRAWS, method="eigh"
     )
@@ -333,10 +330,7 @@ def noise_posterior(
     present, rng = use & np.isfinite(mean), np.random.default_rng(row)
     square, information, spectrum = fit_squares(fit)
     density = HOUR * float(with_floor(square, fit)[1])
-    B_of_powers, K_of_powers = np.sqrt(square[2:])
-    coarse_K, coarse_B = fine_grid(
-        density, mean.size * step, step, of_powers=(K_of_powers, B_of_powers)
-    )
+    coarse_K, coarse_B = fine_grid(density, mean.size * step, step)
     K, B = (axis_values.ravel() for axis_values in np.meshgrid(coarse_K, coarse_B, indexing="ij"))
     means = AxisMeans(
         np.where(present, mean, 0.0)[:, None],
@@ -351,7 +345,8 @@ def noise_posterior(
     if with_angle is not means:
         means, slow = with_angle, with_angle.log_likelihood(K, B)
     fast, best, normal = _likelihood_of_powers(fit, spectrum, K, B)
-    joined = bool(slow.max() + fast.max() - (slow + fast).max() < settings.disagreement_nats)
+    fast_max = max(fast.max(), _log_likelihood(fit, spectrum))  # the grid may end before the best K
+    joined = bool(slow.max() + fast_max - (slow + fast).max() < settings.disagreement_nats)
     log = slow + fast if joined else slow
     weight = np.exp(log - log.max())
     weight /= weight.sum()

@@ -70,15 +70,17 @@ def _on_other_axes(passing: list[str], components: Mapping[str, Sequence[Compone
     """
     if not passing or not passing[0].startswith("~"):
         return passing
-    unexplained_axes: set[str] = set()
-    elsewhere = []
+    alternatives = [key for key in passing if key.startswith("~")]
+    first = []
     for key in passing:
         axes = {axis for component in components[key] for axis in component.row}
-        if key.startswith("~"):
-            unexplained_axes |= axes
-        elif not axes & unexplained_axes:
-            elsewhere.append(key)
-    return elsewhere or passing
+        rivals = [
+            sum_evidence([other for other in components[alternative] if axes & {*other.row}])
+            for alternative in alternatives
+        ]
+        if key not in alternatives and max(rivals) < sum_evidence(components[key]):
+            first.append(key)
+    return first or passing
 
 
 def order_rivals(
