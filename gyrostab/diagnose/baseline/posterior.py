@@ -345,7 +345,8 @@ def noise_posterior(
     if with_angle is not means:
         means, slow = with_angle, with_angle.log_likelihood(K, B)
     fast, best, normal = _likelihood_of_powers(fit, spectrum, K, B)
-    fast_max = max(fast.max(), _log_likelihood(fit, spectrum))  # the grid may end before the best K
+    is_in_grid = square[3] <= K.max() ** 2 and square[2] <= B.max() ** 2
+    fast_max = fast.max() if is_in_grid else _log_likelihood(fit, spectrum)
     joined = bool(slow.max() + fast_max - (slow + fast).max() < settings.disagreement_nats)
     log = slow + fast if joined else slow
     weight = np.exp(log - log.max())
