@@ -55,7 +55,7 @@ def moving_blocks_of_axis(mean: Array, span: float, settings: Settings) -> NDArr
 
     The level at rest is where a quarter of the means lie closest together, if a third of the record
     is at rest. Otherwise it is that of the steadiest stretch; a random walk has one by chance in 1
-    of 300 records of 4000 blocks, and in none of 5000 shorter ones.
+    of 300 records of 4000 blocks, and in none of 4800 shorter ones.
     """
     good = np.isfinite(mean)
     if good.sum() < settings.min_rest_blocks:
