@@ -2,12 +2,12 @@
 
     python benchmarks/name_probability.py proof-tuning [MORE ...]
 
-Fits `set_probability` of `gyrostab.diagnose.settings` to the names of the diagnoses in these
-folders by maximum likelihood (`gyrostab.diagnose.result.verdict` has the law), and with it the
-prior weight of an alternative relative to the name, which should be 1. Prints both with their
-standard errors, the calibration error of the law, and its log score against that of one
-probability for all names, which is fitted to nine tenths and scored on the other, ten times. Seeds
-of `gyrostab prove` below 1 000 000 are for such tuning.
+Fits `set_probability` and `alternative_weight` of `gyrostab.diagnose.settings` to the names of the
+diagnoses in these folders by maximum likelihood (`gyrostab.diagnose.result.verdict` has the law).
+Prints both with their standard errors, the log scores and calibration errors of the values in the
+settings, and of values fitted to the other folders only; and the log score of one probability for
+all names, which is fitted to nine tenths and scored on the other, ten times. Give runs of which the
+ground truths are known already: a seed below 1 000 000, or one in the register of docs/proof.md.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ STEP = 1e-3
 class Names(NamedTuple):
     """Identified names."""
 
+    run: NDArray[np.int64]  # number of the folder
     rivals: Array  # sum of exp(evidence of an alternative - evidence) over the alternatives
     right: NDArray[np.bool_]
 
@@ -60,26 +61,34 @@ def main() -> None:
         strict=True,
     ):
         print(f"{label}: {value:.3f} ({low:.3f} to {high:.3f})")
-    stated = DEFAULTS.set_probability / (1.0 + names.rivals)
-    error = expected_calibration_error(stated, names.right.astype(float))
-    score = log_score(stated, names.right)
-    print(f"stated: log score {score:.3f} nats, calibration error {error:.3f}")
+    stated = DEFAULTS.set_probability / (1.0 + DEFAULTS.alternative_weight * names.rivals)
+    print_score("stated", stated, names.right)
+    if len(np.unique(names.run)) > 1:
+        print_score("fitted to the other folders", fit_without_own_run(names), names.right)
     constant = cross_validate(names)
     print(f"one probability for all names: log score {log_score(constant, names.right):.3f} nats")
 
 
+def print_score(label: str, stated: Array, right: NDArray[np.bool_]) -> None:
+    """Print the log score and the calibration error of stated probabilities."""
+    error = expected_calibration_error(stated, right.astype(float))
+    score = log_score(stated, right)
+    print(f"{label}: log score {score:.3f} nats, calibration error {error:.3f}")
+
+
 def collect_names(runs: list[Path]) -> Names:
     """Read the diagnoses and ground truths of blind tests."""
-    rivals, right = [], []
-    for run in runs:
+    numbers, rivals, right = [], [], []
+    for number, run in enumerate(runs):
         for path in sorted((run / "diagnoses").glob("*.json")):
             diagnosis = json.loads(path.read_text(encoding="utf-8"))
             truth = json.loads((run / "truth" / path.name).read_text(encoding="utf-8"))
             for case in drawn_rows(score_case(diagnosis, truth))[:1]:
                 for identification in case["identifications"]:
+                    numbers.append(number)
                     rivals.append(sum_rivals(identification["name"], diagnosis))
                     right.append(identification["exact"])
-    return Names(np.array(rivals), np.array(right))
+    return Names(np.array(numbers), np.array(rivals), np.array(right))
 
 
 def sum_rivals(name: str, diagnosis: dict[str, Any]) -> float:
@@ -131,6 +140,16 @@ def curvature(law: Array, names: Names) -> Array:
             for first in steps
         ]
     )
+
+
+def fit_without_own_run(names: Names) -> Array:
+    """Return the probability of each name by the law that is fitted to the other folders."""
+    stated = np.empty(names.right.size)
+    for run in np.unique(names.run):
+        own = names.run == run
+        law = fit_law(Names(*(values[~own] for values in names)))
+        stated[own] = probabilities(law, names.rivals[own])
+    return stated
 
 
 def cross_validate(names: Names) -> Array:

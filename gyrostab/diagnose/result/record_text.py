@@ -49,14 +49,14 @@ def summary(content: Mapping[str, Any]) -> str:
 
 
 def _doubt_texts(named: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Say which alternatives are more probable than a name, a sentence for each doubtful name.
+    """Say what else a doubtful name may be, a sentence for each.
 
     Examples
     --------
     >>> bias = {"name": "temperature_bias", "alternatives": ["thermal_hysteresis"]}
     >>> _doubt_texts([bias | {"probability": 0.098}])
-    ['A bias with temperature hysteresis is more probable than a bias that follows temperature
-      (10 %).']
+    ['It may instead be a bias with temperature hysteresis: the probability of a bias that follows
+      temperature is only 10 %.']
     >>> _doubt_texts([{"name": "dead_zone", "alternatives": [], "probability": 0.0}])
     ['The probability that it is a dead zone near zero rate is only 0 %.']
     """
@@ -69,7 +69,7 @@ def _doubt_texts(named: Sequence[Mapping[str, Any]]) -> list[str]:
         share = f"{100 * effect['probability']:.0f} %"
         others = " or ".join(map(plain_name, effect["alternatives"]))
         texts.append(
-            f"{others[0].upper()}{others[1:]} is more probable than {plain_name(name)} ({share})."
+            f"It may instead be {others}: the probability of {plain_name(name)} is only {share}."
             if others
             else f"The probability that it is {plain_name(name)} is only {share}."
         )

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.special import logsumexp
 
 from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -52,25 +53,20 @@ def failed_checks(held: Mapping[str, Any], *, settings: Settings = DEFAULTS) -> 
 
 
 def doubtful_names(effects: Iterable[Mapping[str, Any]]) -> list[str]:
-    """List the effects that an alternative is more probable than, each once.
-
-    Such a name has less than half of its share if all were equally probable. An effect without
-    alternatives is doubtful below 50 %.
+    """List the effects that are more probably wrong than right, each once.
 
     Examples
     --------
-    >>> warm_up = {"name": "warm_up", "alternatives": ["temperature_bias"]}
-    >>> doubtful_names([warm_up | {"probability": 0.475}])
+    >>> doubtful_names([{"name": "warm_up", "probability": 0.74}])
     []
-    >>> doubtful_names([warm_up | {"probability": 0.2}])
+    >>> doubtful_names([{"name": "warm_up", "probability": 0.2}])
     ['warm_up']
     """
     return list(
         dict.fromkeys(
             effect["name"]
             for effect in effects
-            if effect.get("probability") is not None
-            and effect["probability"] * (1 + len(effect["alternatives"])) < 0.5
+            if effect.get("probability") is not None and effect["probability"] < 0.5
         )
     )
 
@@ -79,9 +75,9 @@ def name_probability(identification: Selection, *, settings: Settings = DEFAULTS
     r"""Return the probability that the record contains this effect, and not an alternative.
 
     With the evidence :math:`E` of the effect [nats], and :math:`E_k` of its alternatives in its
-    place, it is :math:`p / (1 + \sum_k \exp(E_k - E))`: p is the probability that one of them is
-    right, and all are equally probable beforehand. An alternative that predicts the same data has
-    the same evidence. `benchmarks/name_probability.py` compares it with blind tests.
+    place, it is :math:`p / (1 + w \sum_k \exp(E_k - E))`: p is the probability that one of them is
+    right, and w the weight of an alternative of equal evidence. An alternative that predicts the
+    same data has the same evidence. `benchmarks/name_probability.py` fits p and w to blind tests.
 
     Examples
     --------
@@ -98,7 +94,8 @@ def name_probability(identification: Selection, *, settings: Settings = DEFAULTS
         for name in identification.alternatives
     ]
     # E_k - E may be any number of nats.
-    share = np.exp(evidence_nats - np.logaddexp.reduce([evidence_nats, *other_nats]))
+    weights = [1.0, *[settings.alternative_weight] * len(other_nats)]
+    share = np.exp(evidence_nats - logsumexp([evidence_nats, *other_nats], b=weights))
     return float(settings.set_probability * share)
 
 

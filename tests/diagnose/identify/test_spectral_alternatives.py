@@ -45,5 +45,5 @@ def test_vibration_noise_is_alone_only_if_its_spectrum_fits(kind: str, is_separa
     assert set(identification.alternatives) == (
         set() if is_separated else names - {identification.effect}
     )
-    share = 1.0 if is_separated else 0.5
+    share = 1.0 if is_separated else 1.0 / (1.0 + DEFAULTS.alternative_weight)
     assert name_probability(identification) == pytest.approx(share * DEFAULTS.set_probability)

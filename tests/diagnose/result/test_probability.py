@@ -11,7 +11,7 @@ from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import Settings
 
-SETTINGS = Settings(set_probability=0.9)
+SETTINGS = Settings(set_probability=0.9, alternative_weight=0.5)
 ALONE = Selection("shupe", ("temperature",), ("x",), (), 20.0, 8.0)
 
 
@@ -23,9 +23,9 @@ def probability(*alternatives: str, **instead: float) -> float:
 def test_an_alternative_takes_its_share():
     assert probability() == 0.9
     # one that predicts the same data
-    assert probability("thermal_gradient") == pytest.approx(0.45)
-    assert probability("thermal_gradient", thermal_gradient=20.0) == pytest.approx(0.45)
-    assert probability("thermal_gradient", "ageing_bias") == pytest.approx(0.3)
+    assert probability("thermal_gradient") == pytest.approx(0.6)
+    assert probability("thermal_gradient", thermal_gradient=20.0) == pytest.approx(0.6)
+    assert probability("thermal_gradient", "ageing_bias") == pytest.approx(0.45)
 
 
 def test_evidence_against_an_alternative_raises_the_probability():
@@ -35,7 +35,7 @@ def test_evidence_against_an_alternative_raises_the_probability():
     assert probabilities == sorted(probabilities)
     assert probabilities[-1] == pytest.approx(0.9, abs=1e-4)
     # a plainer effect may be named although another has more evidence
-    assert probabilities[0] == pytest.approx(0.9 / (1.0 + np.exp(2.0)))
+    assert probabilities[0] == pytest.approx(0.9 / (1.0 + 0.5 * np.exp(2.0)))
     assert probability("rate_quantization", rate_quantization=7e5) == 0.0
 
 
