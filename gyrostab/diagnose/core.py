@@ -23,6 +23,7 @@ from gyrostab.diagnose.estimate.recalibrate import remove_fast_switching
 from gyrostab.diagnose.estimate.unexplained_motion import unexplained_motion
 from gyrostab.diagnose.identify.examination import prepare_examination
 from gyrostab.diagnose.identify.identification import components_of
+from gyrostab.diagnose.identify.late_channels import find_late_channel
 from gyrostab.diagnose.identify.selection import identify_effects
 from gyrostab.diagnose.locate.mismatches import Region, locate_mismatches
 from gyrostab.diagnose.nulls.records import repeatable_null_records
@@ -44,6 +45,7 @@ from gyrostab.diagnose.task import (
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.convert import as_log
 from gyrostab.progress import Stage, no_stage
+from gyrostab.schema.delays import move_channels
 from gyrostab.simulate.model import Model
 
 
@@ -134,20 +136,48 @@ def diagnose(
 def _run_steps(task: Task, block: Any) -> Diagnosis:
     """Run the seven steps in their order; each reason to compare again occurs at most once."""
     started = time.perf_counter()
-    task, blocks = _reduce_recording(task, block)
-    named = _identify_effects(task, *_calibrate_baseline(task, blocks))
-    for revise in (_leave_out_motion, _leave_motion_out_of_lines, _take_out_fast_switching):
-        named = revise(task, named) or named
+    task, named = _identify_with_late_channels(task, block)
     mismatches, null = _locate_mismatches(task, named)
     task.progress("fitting", 0)
     return finish_diagnosis(task, named, mismatches, null, started)
+
+
+def _identify_with_late_channels(task: Task, block: Any) -> tuple[Task, NamedBlocks]:
+    """Steps 1 to 4; again with a channel moved in time if that explains more, each channel once."""
+    model = task.simulation
+    delays = dict(model.delay) if isinstance(model, Model) else {}
+    current, named = _identify_with_delays(task, block, delays)
+    while late := find_late_channel(
+        named.examination, named.identifications, named.baseline, current.log, delays
+    ):
+        channel, delay_s = late
+        tried = {**delays, channel: delay_s}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # given above
+            moved = _identify_with_delays(task, block, tried)
+        if not any(channel in effect.driver for effect in moved[1].identifications.identified):
+            break
+        delays, (current, named) = tried, moved
+    return current, named
+
+
+def _identify_with_delays(
+    task: Task, block: Any, delays: Mapping[str, float]
+) -> tuple[Task, NamedBlocks]:
+    """Steps 1 to 4, with late channels moved by their delays [s]."""
+    log = move_channels(task.log, delays).assign_attrs(channel_delays=dict(delays))
+    task, blocks = _reduce_recording(replace(task, log=log), block)
+    named = _identify_effects(task, *_calibrate_baseline(task, blocks))
+    for revise in (_leave_out_motion, _leave_motion_out_of_lines, _take_out_fast_switching):
+        named = revise(task, named) or named
+    return task, named
 
 
 def _reduce_recording(task: Task, block: Any) -> tuple[Task, xr.Dataset]:
     """Step 1: reduce the axes that vary to block statistics."""
     aligned = align_channels(task.log)
     for note in aligned.notes:
-        warnings.warn(note, stacklevel=5)
+        warnings.warn(note, stacklevel=6)
     log = aligned.log.assign_attrs(unused_channels=aligned.unused)
     simulation = task.simulation
     blocks = task.reduce(log, block=block)
@@ -251,7 +281,7 @@ def _leave_out_motion(task: Task, named: NamedBlocks) -> NamedBlocks | None:
     except SchemaError as error:
         warnings.warn(
             f"the diagnosis includes unexplained motion: without it too little is left ({error})",
-            stacklevel=4,
+            stacklevel=6,
         )
         return None
     return _identify_effects(task, *calibrated)

@@ -424,6 +424,13 @@ class Settings:
         "times",
     )
 
+    max_delay_s: float = _make_setting(
+        300.0,
+        "s",
+        "Largest delay of a channel against the rates that is looked for.",
+        "choice: clocks that are set by hand differ by minutes",
+    )
+
     set_probability: float = _make_setting(
         0.93,
         "1",

@@ -138,7 +138,7 @@ def varying_axes(blocks: xr.Dataset) -> list[str]:
         )
     if constant:
         warnings.warn(
-            f"all samples are the same on axis {constant}: left out of the diagnosis", stacklevel=5
+            f"all samples are the same on axis {constant}: left out of the diagnosis", stacklevel=7
         )
     return varying
 

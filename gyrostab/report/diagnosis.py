@@ -15,7 +15,7 @@ import xarray as xr
 from gyrostab.diagnose.result.content import check_diagnosis
 from gyrostab.diagnose.result.diagnosis import Diagnosis, model_text
 from gyrostab.diagnose.result.families import group_families
-from gyrostab.diagnose.result.record_text import noise_texts, span_seconds, summary
+from gyrostab.diagnose.result.record_text import delay_texts, noise_texts, span_seconds, summary
 from gyrostab.diagnose.result.text import (
     chance_share,
     family_text,
@@ -75,6 +75,7 @@ def write_diagnosis_report(
             length=length_text(
                 span_seconds(content["recording"]["start"], content["recording"]["end"])
             ),
+            delay_texts=delay_texts(content),
             noise_texts=[text.strip() for text in noise_texts(content)[1:]],
             effects=cards,
             mismatches=rows,

@@ -16,6 +16,7 @@ from gyrostab.ingest.convert import as_log
 from gyrostab.ingest.gap_table import gap_variables
 from gyrostab.noise import TERMS
 from gyrostab.physics.base import STAGES, Effect, Setup, driver_error
+from gyrostab.physics.registry import close_to
 from gyrostab.schema import (
     SIGNAL_LONG_NAMES,
     SIGNAL_UNITS,
@@ -24,6 +25,7 @@ from gyrostab.schema import (
     log_channels,
     signal_name,
 )
+from gyrostab.schema.delays import move_channels
 from gyrostab.simulate.block import BlockState, Plan, Step, lazy_rates
 from gyrostab.simulate.channels import combine
 from gyrostab.simulate.drivers import Source, make_course, make_source
@@ -202,6 +204,13 @@ def _make_plan(
     """Make the plan from the tables of all gaps, and of those that a recording does not have."""
     table, lost = tables
     present = log_channels(environment)
+    for name in model.delay:
+        if name not in present:
+            raise OptionError(
+                f"{model.source}: [delay]: the log has no channel {name!r}"
+                f"{close_to(name, present)}; it has {', '.join(present) or 'none'}"
+            )
+    environment = move_channels(environment, model.delay)
     measured = [] if like is None else log_channels(like)
     steps = []
     for effect in sorted(model.effects, key=lambda effect: STAGES.index(effect.stage)):

@@ -25,6 +25,8 @@ from gyrostab.time.stamps import stamp_ns
 
 #: Largest noise coefficient: its square, and sums of squares, stay within the range of numbers.
 _MAX_COEFFICIENT = 1e100
+#: Largest bias [deg/h], and largest delay [s]: a day.
+_LARGEST = {"bias": _MAX_COEFFICIENT, "delay": 86400.0}
 
 #: Function of the environment -> (the function, unit of each number).
 PROFILES: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
@@ -88,6 +90,8 @@ class Model:
     flicker_band: tuple[float, float] = (FLICKER_LOW, math.inf)
     #: Constant rate of axes [deg/h]; 0 for others
     bias: Mapping[str, float] = field(default_factory=dict)
+    #: Channel -> by how much its time stamps are late [s]; 0 for others
+    delay: Mapping[str, float] = field(default_factory=dict)
     effects: tuple[Effect, ...] = ()  #
     #: Function of `PROFILES` and its arguments
     environment: tuple[tuple[str, Mapping[str, Any]], ...] = ()
@@ -157,12 +161,12 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
             raise FormatError(f"{path}: cannot be read ({error.strerror})") from error
         except (ValueError, RecursionError) as error:
             raise FormatError(f"{path}: not a TOML file ({error})") from error
-    sections = ("log", "noise", "bias", "effect", "environment")
+    sections = ("log", "noise", "bias", "delay", "effect", "environment")
     for key, table in tables.items():
         if key not in sections:
             raise OptionError(
                 f"{where}: there is no section {key!r}{close_to(key, sections)}; "
-                "there are [log], [noise], [bias], [[effect]], [[environment]]"
+                "there are [log], [noise], [bias], [delay], [[effect]], [[environment]]"
             )
         if not isinstance(table, list if key in ("effect", "environment") else Mapping):
             raise OptionError(
@@ -191,7 +195,8 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
         axes,
         noise,
         band,
-        _read_bias(tables.get("bias", {}), where),
+        _read_numbers("bias", tables, "deg/h", "an axis of the log", where),
+        _read_numbers("delay", tables, "s", "a channel of the log", where),
         tuple(effects),
         tuple(profiles),
         log,
@@ -229,17 +234,20 @@ def _read_noise(
     return noise, band
 
 
-def _read_bias(table: Mapping[str, Any], where: str) -> dict[str, float]:
-    biases = {}
-    for axis, value in table.items():
-        number = amount(value, "deg/h", f"{where}: bias of {axis}")
-        if not is_number(number) or not abs(number) <= _MAX_COEFFICIENT:
+def _read_numbers(
+    section: str, tables: Mapping[str, Any], unit: str, owner: str, where: str
+) -> dict[str, float]:
+    """Read a section with one number for each axis or channel."""
+    numbers = {}
+    for name, value in tables.get(section, {}).items():
+        number = amount(value, unit, f"{where}: {section} of {name}")
+        if not is_number(number) or not abs(number) <= _LARGEST[section]:
             raise OptionError(
-                f"{where}, [bias]: {axis} = {value!r} is not a number; give one in deg/h for an "
-                "axis of the log"
+                f"{where}, [{section}]: {name} = {value!r} is not a number up to "
+                f"{_LARGEST[section]:g}; give one in {unit} for {owner}"
             )
-        biases[axis] = float(number)
-    return biases
+        numbers[name] = float(number)
+    return numbers
 
 
 def _read_coefficient(term: str, value: Any, where: str) -> float:

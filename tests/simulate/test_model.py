@@ -75,6 +75,7 @@ from tests.support.simulated import BIASED, LOG, WORLD, model
         ({"log": LOG | {"duration": 1e9, "rate": 1e6}}, "a duration of .* has more than 1e.10 "),
         ({"environment": [{"profile": "losses", "per_hour": 1e300}]}, "at most 1e8 gaps"),
         ({"environment": [{"profile": "losses", "seed": "x"}]}, "seed='x': give a whole number"),
+        ({"delay": {"q": np.inf}}, r"\[delay\]: q = inf is not a number up to 86400; give one in "),
         (
             {"environment": [{"profile": "chamber", "lag": "5 m"}]},
             "the unit 'm' is not known here; give the number in s",
@@ -120,6 +121,8 @@ def test_a_wrong_effect_names_file_and_place(tmp_path):
             "needs the channel 'temperature'",
         ),
         ("[noise.x]\nN = 1\n[bias]\nq = 2", "there is no axis 'q' in this log; it has x"),
+        ("[delay]\nvibration = '2 m/s'", "delay of vibration: the unit 'm/s' is not known"),
+        ("[delay]\nvibration = 12", "[delay]: the log has no channel 'vibration'; it has none"),
         ("[log]\nstart = '2262-04-11T23:47:00'", "begin or end outside the years 1678 to 2262"),
         (
             "[log]\noversampling = 2\n[[effect]]\nname = 'feedback_reset'\nkick = 1\n"

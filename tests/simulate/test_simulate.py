@@ -395,3 +395,26 @@ def test_the_rotation_of_the_environment_may_be_in_another_unit():
     log = simulate({}, duration="10s", rate=10.0, environment=turning)
     np.testing.assert_allclose(log.rate.sel(axis="z"), 36.0 * 3600.0, rtol=1e-12)
     assert log.rotation_rate.units == "degree s-1"
+
+
+# --------------------------------------------------------------------------------
+# late channels
+
+
+@pytest.mark.parametrize("own_stamps", [True, False])
+@pytest.mark.parametrize(("delay", "step"), [(20.0, 40), (-15.0, 75)])
+def test_effects_take_a_late_channel_earlier(own_stamps: bool, delay: float, step: int) -> None:
+    """A step that the channel shows after 60 s; the log keeps the channel as it is."""
+    world = ramps("temperature", "degC", [[0, 0], [59.9, 0], [60, 10], [120, 10]], duration=120.0)
+    recorded = make_log(np.zeros((1, 120)), rate=1.0, unit="deg/h", start="1970-01-01")
+    if own_stamps:
+        recorded = recorded.assign_coords(world.coords).assign(world.data_vars)
+    else:
+        values = world["temperature"].values[:120]
+        recorded = recorded.assign(temperature=("time", values, world["temperature"].attrs))
+    effect = {"name": "temperature_bias", "sensitivity": 1.0, "reference": 0.0}
+    late = {"effect": [effect], "delay": {"temperature": delay}}
+    log = simulate(late, like=recorded)
+    expected = np.where(np.arange(120) < step, 0.0, 10.0)
+    np.testing.assert_allclose(log["rate"].values[0], expected, atol=1e-9)
+    xr.testing.assert_equal(log["temperature"], recorded["temperature"])

@@ -313,4 +313,5 @@ def _make_attributes(
         "source_files": texts(log, "source_files"),
         "notes": texts(log, "notes"),
         "unused_channels": dict(log.attrs.get("unused_channels", {})),
+        "channel_delays": dict(log.attrs.get("channel_delays", {})),
     }

@@ -13,6 +13,7 @@ from gyrostab.diagnose.reduce.aligned_channels import interpolate_linearly
 from gyrostab.schema import find_unusable_channels, log_channels, signal_name
 from gyrostab.simulate.drivers import make_source
 from gyrostab.store import lazy
+from gyrostab.time.grid import TimeGridIndex, grid_index
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import HOUR
 
@@ -111,9 +112,12 @@ def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: 
     The ends of the intervals rise [ns since 1970]. The mean, or the root mean square, is NaN where
     the channel has no value for longer than three of its median intervals.
     """
-    stamps = to_nanoseconds(log[f"time_{name}"].values)
-    data = log[name].data
-    ends = np.searchsorted(stamps, edges)
+    data, index = log[name].data, log.xindexes.get(f"time_{name}")
+    if isinstance(index, TimeGridIndex):
+        places = np.ceil(grid_index(index.start, index.rate, edges))
+        ends = np.clip(places, 0, data.size).astype(np.int64)
+    else:
+        ends = np.searchsorted(to_nanoseconds(log[f"time_{name}"].values), edges)
     sums, counts = np.zeros(edges.size - 1), np.zeros(edges.size - 1)
     low = 0
     while low < edges.size - 1:
@@ -123,15 +127,16 @@ def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: 
         )
         values = np.asarray(lazy.read_slice(data, ends[low], ends[high]), dtype=np.float64)
         good = np.isfinite(values)
-        index = np.repeat(np.arange(low, high), np.diff(ends[low : high + 1]))[good]
-        sums += np.bincount(index, (values**2 if rms else values)[good], minlength=sums.size)
-        counts += np.bincount(index, minlength=sums.size)
+        number = np.repeat(np.arange(low, high), np.diff(ends[low : high + 1]))[good]
+        sums += np.bincount(number, (values**2 if rms else values)[good], minlength=sums.size)
+        counts += np.bincount(number, minlength=sums.size)
         low = high
     with np.errstate(invalid="ignore", divide="ignore"):
         means = sums / counts
     means = np.sqrt(means) if rms else means
-    if not (1 < stamps.size <= _CHANNEL_VALUES_PER_READ and counts.any()):
+    if not (1 < data.size <= _CHANNEL_VALUES_PER_READ and counts.any()):
         return means
+    stamps = to_nanoseconds(log[f"time_{name}"].values)
     source = make_source(log, name)
     assert source.stamps is not None
     line = interpolate_linearly(

@@ -162,6 +162,13 @@ class UnusedChannel(_Table):
     reason: str
 
 
+class ChannelDelay(_Table):
+    """A channel whose time stamps are late; below zero, early."""
+
+    name: str
+    delay_s: float
+
+
 class HeldOut(_Table):
     """Evidence on held-out data."""
 
@@ -190,6 +197,7 @@ class Content(_Table):
     not_found: dict[str, NotFound]
     rejected: list[Rejected] = []
     unused_channels: list[UnusedChannel] = []
+    channel_delays: list[ChannelDelay] = []
     held_out: HeldOut
     seconds: NotNegative
 

@@ -12,7 +12,13 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.result.families import group_families
-from gyrostab.diagnose.result.record_text import join_axes, joined_statements, noise_texts, summary
+from gyrostab.diagnose.result.record_text import (
+    delay_texts,
+    join_axes,
+    joined_statements,
+    noise_texts,
+    summary,
+)
 from gyrostab.diagnose.result.text import (
     chance_share,
     family_text,
@@ -90,6 +96,7 @@ class Diagnosis:
                 lines.append(f"  {sure}")
             if step := next_measurement(effect["name"], effect["alternatives"]):
                 lines.append(f"  {step}")
+        lines += [f"- {text}" for text in delay_texts(self.content)]
         lines += [
             f"- channel {channel['name']} is not used: {channel['reason']}"
             for channel in self.content.get("unused_channels", [])

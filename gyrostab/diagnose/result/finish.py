@@ -90,6 +90,10 @@ def finish_diagnosis(
         "not_found": find_upper_limits(fit.identifications),
         "rejected": rejected_tables(fit.identifications),
         "unused_channels": unused_channels(blocks, used),
+        "channel_delays": [
+            {"name": name, "delay_s": delay_s}
+            for name, delay_s in blocks.attrs["channel_delays"].items()
+        ],
         "held_out": held,
         "seconds": round(time.perf_counter() - started, 3),
     }

@@ -129,6 +129,25 @@ def join_axes(groups: Iterable[Sequence[Mapping[str, Any]]]) -> list[list[Mappin
     return joined
 
 
+def delay_texts(content: Mapping[str, Any]) -> list[str]:
+    """Say which channels were moved in time, a sentence for each.
+
+    Examples
+    --------
+    >>> delay_texts({"channel_delays": [{"name": "vibration", "delay_s": 103.0}]})
+    ['The time stamps of channel vibration are 103 s late: the rates follow it that much earlier.']
+    """
+    return [
+        f"The time stamps of channel {channel['name']} are {abs(channel['delay_s']):g} s "
+        + (
+            "late: the rates follow it that much earlier."
+            if channel["delay_s"] > 0.0
+            else "early: the rates follow it that much later."
+        )
+        for channel in content.get("channel_delays", [])
+    ]
+
+
 def noise_texts(content: Mapping[str, Any]) -> list[str]:
     r"""Say which noise was calibrated on each axis, and where the axes differ.
 

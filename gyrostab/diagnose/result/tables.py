@@ -220,6 +220,7 @@ def model_tables(
         **log,
         "noise": {**flicker, **noise},
         "bias": {axis: float(f"{rate:.6g}") for axis, rate in rates.items()},
+        "delay": dict(blocks.attrs["channel_delays"]),
         "effect": [effect_table(effect) for effect in [*given_effects, *added_effects]],
     }
     components = [component for effect_fit in fitted for component in effect_fit.components]

@@ -35,12 +35,17 @@ Array = NDArray[Any]
 
 
 def effect_candidates(
-    blocks: xr.Dataset, coefficient: xr.DataArray, *, settings: Settings = DEFAULTS
+    blocks: xr.Dataset,
+    coefficient: xr.DataArray,
+    *,
+    channel: str | None = None,
+    settings: Settings = DEFAULTS,
 ) -> tuple[list[Candidate], dict[str, str]]:
     """Build the candidates of all registered effects that this record can show.
 
     The second result says why the others cannot be seen. The coefficients are the noise of the
-    baseline ``(axis, term)``, in units of the noise model.
+    baseline ``(axis, term)``, in units of the noise model. With a `channel`, only candidates that
+    follow this channel of the log are built.
 
     Examples
     --------
@@ -60,6 +65,8 @@ def effect_candidates(
     candidates: list[Candidate] = []
     reasons: dict[str, str] = {}
     for name, kind in effects().items():
+        if channel is not None and not kind.channels:
+            continue
         if other := kind.look_alikes("size"):
             form = effects()[other[0]].plain
             reasons[name] = f"not identifiable: it has the form of {form}; {kind.next_measurement}"
@@ -70,6 +77,8 @@ def effect_candidates(
             reasons[name] = "not identifiable: the quantization grid is too coarse"
             continue
         for drivers in _driver_assignments(kind, blocks, units):
+            if channel is not None and channel not in drivers.values():
+                continue
             added, obstacle = _candidates_of_effect(kind, blocks, drivers, coefficient, settings)
             built += added
             reason = reason or obstacle

@@ -1,0 +1,203 @@
+"""Find a channel whose time stamps are late or early: moved in time, it explains the rates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from gyrostab.diagnose.identify.components import sum_evidence
+from gyrostab.diagnose.identify.examination import Examination
+from gyrostab.diagnose.identify.identification import Identifications, Selection
+from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.windows import channel_units
+from gyrostab.diagnose.reduce.log_blocks import channel_means
+from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.schema.delays import move_channels
+from gyrostab.time.grid import grid_times
+
+#: Parts of a block in which a delay is resolved. Design choice.
+_PARTS = 16
+#: Blocks of the record in each block of the largest delay: most delays have to be too large for a
+#: clock, to be compared with.
+_MIN_RECORD_DELAYS = 6
+#: Delays too large for a clock with which the best one is compared; limits the time.
+_MAX_OTHER_DELAYS = 64
+Array = NDArray[np.float64]
+
+
+def find_late_channel(
+    examination: Examination,
+    identifications: Identifications,
+    baseline: xr.Dataset,
+    log: xr.Dataset,
+    moved: Collection[str] = (),
+) -> tuple[str, float] | None:
+    """Return the channel that explains the rates once it is moved, and by how much it is late [s].
+
+    A channel is moved only to explain what no channel explains at its own time. All delays of all
+    channels are equally probable, so that the evidence of the best one must exceed the threshold,
+    and that of the channel at its own time, by the logarithm of their number. It must also exceed
+    what explains the rates without a channel.
+
+    A channel that has nothing to do with the rates explains as much at delays that are too large
+    for a clock, round the record. Evidence by chance has an exponential tail, as half of a
+    chi-square: the largest of n values at such delays is the scale of the tail times ln n, and
+    one of m values in the range exceeds the scale times ln(m / p) with the probability p. Delays at
+    which the channel resembles itself do not count; a smooth channel has no others, and stays.
+    Channels in `moved` stay too. None if there is no late channel.
+    """
+    settings, blocks = examination.settings, examination.start.blocks
+    unexplained = [
+        selection
+        for selection in (*identifications.identified, *identifications.unknown)
+        if _may_follow_channel(selection)
+    ]
+    block_s = float(blocks.attrs["block_s"])
+    reach = min(int(settings.max_delay_s / block_s), blocks.sizes["block"] // _MIN_RECORD_DELAYS)
+    channels = [name for name in channel_units(blocks) if name not in moved]
+    if not unexplained or reach == 0 or not channels:
+        return None
+    explained = [effect for effect in identifications.identified if effect not in unexplained]
+    search = _Search(examination, examination.state_with(explained), baseline, log, reach)
+    best = search.find_best(channels)
+    count = 2 * reach * len(channels)
+    on_time_nats = float(search.evidence(best.channel, search.parts(best.channel), [0])[0])
+    needed_nats = max(examination.threshold, on_time_nats) + math.log(_PARTS * count)
+    if best.nats <= needed_nats:
+        return None
+    best = search.refine(best)
+    needed_nats = max(needed_nats, *(selection.evidence_nats for selection in unexplained))
+    if best.nats <= needed_nats or not search.exceeds_chance(best, count):
+        return None
+    return best.channel, float(f"{best.parts * block_s / _PARTS:.4g}")
+
+
+class _Delay(NamedTuple):
+    """A delay of a channel, and the evidence of the effect that then follows it best."""
+
+    nats: float
+    parts: int  # parts of a block by which the channel is late
+    channel: str
+
+
+def _may_follow_channel(selection: Selection) -> bool:
+    """Return whether a selection has a course in time that no channel gives."""
+    return not any(selection.driver) and not any(
+        component.statistic.is_count or component.statistic.is_line
+        for component in selection.components
+    )
+
+
+@dataclass(frozen=True)
+class _Search:
+    """The record in which channels are moved."""
+
+    examination: Examination
+    state: State  # with the effects that are explained
+    baseline: xr.Dataset
+    log: xr.Dataset
+    reach: int  # blocks in the largest delay of a clock
+
+    def find_best(self, channels: Iterable[str]) -> _Delay:
+        """Return the delay of whole blocks with the most evidence, of any channel."""
+        shifts = _PARTS * np.delete(np.arange(-self.reach, self.reach + 1), self.reach)
+        return max(
+            _Delay(float(nats), int(shift), channel)
+            for channel in channels
+            for shift, nats in zip(
+                shifts, self.evidence(channel, self.parts(channel), shifts), strict=True
+            )
+        )
+
+    def refine(self, best: _Delay) -> _Delay:
+        """Return the best delay near another one, to a part of a block."""
+        parts, step = self.parts(best.channel), _PARTS
+        while step > 1:
+            step //= 2
+            shifts = best.parts + step * np.arange(-1, 2)
+            nats = self.evidence(best.channel, parts, shifts)
+            best = best._replace(nats=float(nats.max()), parts=int(shifts[nats.argmax()]))
+        return best
+
+    def exceeds_chance(self, best: _Delay, count: int) -> bool:
+        """Test whether the best of `count` delays explains more than delays that no clock has.
+
+        False if the channel resembles itself at most of them.
+        """
+        settings = self.examination.settings
+        parts = self.parts(best.channel)
+        shifts = _PARTS * np.arange(self.reach, parts.size // _PARTS - self.reach + 1)
+        shifts = shifts[np.abs(_correlations(parts, shifts)) <= settings.majority_share]
+        if shifts.size < settings.min_surrogates:
+            return False
+        number = min(shifts.size, _MAX_OTHER_DELAYS)
+        shifts = shifts[np.linspace(0, shifts.size - 1, number).astype(int)]
+        chance = self.evidence(best.channel, parts, best.parts + shifts, wrap=True).max()
+        return bool(
+            best.nats * math.log(number) > chance * math.log(count / settings.surrogate_share)
+        )
+
+    def parts(self, channel: str) -> Array:
+        """Return the channel in parts of the blocks; the mean square where the rms matters."""
+        blocks = self.examination.start.blocks
+        count, samples = blocks.sizes["block"], int(blocks.attrs["block_samples"])
+        edges = grid_times(
+            int(blocks.attrs["start_ns"]),
+            float(blocks.attrs["sampling_rate_hz"]),
+            np.arange(count * _PARTS + 1) * samples // _PARTS,
+        )
+        with_stamps = move_channels(self.log, {channel: 0.0})
+        means = channel_means(with_stamps, channel, edges, rms=_is_rms(channel))
+        return means**2 if _is_rms(channel) else means
+
+    def evidence(
+        self, channel: str, parts: Array, shifts: Iterable[int], *, wrap: bool = False
+    ) -> Array:
+        """Return the evidence of the effect that follows a channel best, moved by parts [nats].
+
+        With `wrap`, the channel moves round the record, end to start.
+        """
+        blocks = self.examination.start.blocks.drop_vars(f"fine_{channel}", errors="ignore")
+        name = f"channel_{channel}"
+        places = np.arange(parts.size)
+        best = []
+        for shift in shifts:
+            later = (places + shift) % parts.size if wrap else places + shift
+            inside = (later >= 0) & (later < parts.size)
+            in_parts = np.where(inside, parts[np.clip(later, 0, parts.size - 1)], np.nan)
+            good = np.isfinite(in_parts).reshape(-1, _PARTS)
+            sums = np.nansum(in_parts.reshape(-1, _PARTS), axis=1)
+            means = sums / np.where(good.any(axis=1), good.sum(axis=1), np.nan)
+            values = np.sqrt(means) if _is_rms(channel) else means
+            candidates, _ = effect_candidates(
+                blocks.assign({name: ("block", values, blocks[name].attrs)}),
+                self.baseline["coefficient"],
+                channel=channel,
+                settings=self.state.settings,
+            )
+            followers = [
+                candidate
+                for candidate in candidates
+                if candidate.statistic.is_linear_in_means or candidate.statistic.is_power
+            ]
+            components = self.examination.find_components(followers, self.state)
+            best.append(max(map(sum_evidence, components.values()), default=0.0))
+        return np.array(best)
+
+
+def _correlations(parts: Array, shifts: NDArray[np.int64]) -> Array:
+    """Return the correlations of a channel with itself, moved round the record by parts."""
+    centred = np.nan_to_num(parts - np.nanmean(parts))
+    spectrum = np.abs(np.fft.rfft(centred)) ** 2
+    products = np.fft.irfft(spectrum, centred.size)
+    return np.asarray(products[shifts % centred.size] / products[0])
+
+
+def _is_rms(channel: str) -> bool:
+    return channel.startswith("vibration")

@@ -1,0 +1,114 @@
+"""A channel with late time stamps is moved if it then explains the rates, and only then."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from gyrostab.diagnose.core import diagnose
+from gyrostab.diagnose.identify.examination import Examination, prepare_examination
+from gyrostab.diagnose.identify.identification import Identifications
+from gyrostab.diagnose.identify.late_channels import find_late_channel
+from gyrostab.diagnose.identify.selection import identify_effects
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.schema.delays import move_channels
+from gyrostab.simulate import simulate
+from tests.support.named import nulls
+
+DELAY = 47.0  # s
+BURSTS = [[0, 0.1], [150, 4.0], [190, 0.1], [350, 6.0], [440, 0.1], [650, 3.0], [700, 0.1]]
+NOISE = {"N": 0.003, "B": 0.002, "K": 0.01}
+RECTIFIED = {"name": "vibration_rectification", "axes": ["x"], "sensitivity": 0.05}
+SHAKEN = {"profile": "vibration", "points": BURSTS}
+WARMING = {
+    "profile": "ramps",
+    "channel": "temperature",
+    "unit": "degC",
+    "points": [[0, 20], [450, 60], [900, 80]],
+}
+
+
+def recorded(
+    effects: list[dict[str, Any]],
+    delay: float = DELAY,
+    *,
+    own_stamps: bool = True,
+    world: tuple[dict[str, Any], ...] = (SHAKEN,),
+) -> xr.Dataset:
+    """Return a quarter of an hour of a log whose vibration is late."""
+    model = {
+        "noise": NOISE,
+        "effect": effects,
+        "environment": list(world),
+        "log": {"axes": ["x", "y"]},
+    }
+    log = simulate(model, duration="15min", rate=10.0, seed=5).compute()
+    late = move_channels(log, {"vibration": -delay})
+    if own_stamps:
+        return late
+    stamps = late["time_vibration"].values
+    last = np.clip(np.searchsorted(stamps, log["time"].values, "right") - 1, 0, stamps.size - 1)
+    on_time = late["vibration"].variable[last]
+    return log.drop_vars(["vibration", "time_vibration"]).assign(
+        vibration=("time", on_time.values, on_time.attrs)
+    )
+
+
+def examined(log: xr.Dataset) -> tuple[Examination, Identifications, xr.Dataset, xr.Dataset]:
+    blocks = reduce_log(log, block="10s")
+    baseline, records = nulls(blocks)
+    examination = prepare_examination(blocks, baseline, records)
+    return examination, identify_effects(examination), baseline, log
+
+
+@pytest.mark.parametrize(("delay", "own_stamps"), [(DELAY, False), (-123.0, True)])
+def test_late_or_early_channel_is_found(delay: float, own_stamps: bool) -> None:
+    record = examined(recorded([RECTIFIED], delay, own_stamps=own_stamps))
+    found = find_late_channel(*record)
+    assert found is not None
+    assert found[0] == "vibration"
+    assert found[1] == pytest.approx(delay, abs=1.5)  # blocks of 10 s, vibration at 1 Hz
+    assert find_late_channel(*record, moved=["vibration"]) is None
+
+
+@pytest.mark.parametrize(
+    ("effects", "delay", "world"),
+    [
+        ([], DELAY, (SHAKEN,)),
+        ([RECTIFIED], 0.0, (SHAKEN,)),
+        ([RECTIFIED], 400.0, (SHAKEN,)),
+        # the bias follows no channel
+        ([{"name": "bias_jump", "axes": ["x"], "step": [0.2], "at": 450.0}], DELAY, (SHAKEN,)),
+        ([{"name": "ageing_bias", "axes": ["x"], "slope": 20.0}], DELAY, (WARMING, SHAKEN)),
+    ],
+)
+def test_channel_that_does_not_explain_more_stays(
+    effects: list[dict[str, Any]], delay: float, world: tuple[dict[str, Any], ...]
+) -> None:
+    assert find_late_channel(*examined(recorded(effects, delay, world=world))) is None
+
+
+@pytest.mark.slow
+def test_diagnosis_states_the_delay_and_its_model_has_it() -> None:
+    log = recorded([RECTIFIED])
+    found = diagnose(log, nulls=100)
+    (effect,) = found.effects
+    assert effect["name"] == "vibration_rectification"
+    size = effect["parameters"]["sensitivity"]
+    assert size["low"] < RECTIFIED["sensitivity"] < size["high"]
+    ((channel, delay),) = (tuple(entry.values()) for entry in found.content["channel_delays"])
+    assert (channel, delay) == ("vibration", pytest.approx(DELAY, abs=1.0))
+    assert f"stamps of channel vibration are {delay:g} s late" in str(found)
+    assert found.model["delay"] == {"vibration": delay}
+    # simulated again, the rate follows the vibration as in the recording
+    course = simulate({**found.model, "noise": {}}, like=log)["rate"].sel(axis="x").values
+    begin, level = np.array(BURSTS).T
+    shaken = level[np.searchsorted(begin, np.arange(9000) / 10.0, "right") - 1] ** 2
+    assert np.corrcoef(course, shaken)[0, 1] > 0.9
+    # compared with this model, nothing differs
+    again = diagnose(log, simulation=found.model, nulls=100)
+    assert again.verdict == "no mismatch"
+    assert again.content["channel_delays"] == found.content["channel_delays"]
