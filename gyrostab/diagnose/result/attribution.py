@@ -111,8 +111,8 @@ def attribute_mismatches(
     An effect explains a mismatch when it acts on one of its axes at its time and can show in its
     statistic. If the baseline with the effects contains what the effect does there, two more
     conditions apply: the mismatch is gone with that baseline, or nearly so, and this effect is
-    needed for that. A mismatch of the mean may also lie before or after the effect, when the effect
-    causes the difference. In blocks within which an effect moves the rate, power and the lowest
+    needed for that. A mismatch of the mean, or at a restart, may also lie before or after the
+    effect, when the effect causes the difference. In blocks within which an effect moves the rate, power and the lowest
     lines exceed the noise; the effect explains these too.
 
     `after` is the baseline with the effects, and `without` returns that except for those given, at
@@ -229,9 +229,9 @@ def _is_caused_elsewhere(
     """Return whether a mismatch of the mean is due to what an effect does at other times.
 
     The constant of a record is free: a mean that is higher in one part is lower in the rest, and
-    either may be the mismatch.
+    either may be the mismatch. A mean that differs after a restart may be due to an effect before.
     """
-    if str(region["view"]) != "mean" or not all(
+    if str(region["view"]) not in ("mean", "restart") or not all(
         component.statistic.is_in_means for component in components
     ):
         return False

@@ -303,3 +303,40 @@ def test_leaving_out_power_that_was_fitted_below_zero_adds_none(shaken):
     whole, without = fit_powers(state, "x"), fit_powers(state, "x", np.array([True]))
     np.testing.assert_allclose(whole[18:20], MIN_POWER_RATIO * state.weight[0, 18:20])
     np.testing.assert_allclose(without[:20] / without[20:40], 1.0, atol=0.2)
+
+
+def test_mean_after_a_restart_is_explained_by_an_effect_before_it() -> None:
+    """The power fails between two blocks, five blocks after a burst of vibration."""
+    quiet = record([])
+    g = quiet["channel_vibration"].values
+    burst_end = int(np.flatnonzero(g > 1.0)[-1])
+    lost = float(quiet["end"].values[burst_end + 5])
+    table = {
+        f"restart_{side}": ("restart", [lost + gap])
+        for side, gap in (("begin", -3.0), ("end", 0.0))
+    }
+    blocks = quiet.drop_dims("restart").assign(table)
+    baseline, chance = nulls(blocks, 60)
+    changed = blocks.assign(mean=blocks["mean"] + np.stack([0.02 * g**2, 0 * g, 0 * g]))
+    candidates, reasons = effect_candidates(changed, COEFFICIENT)
+    bias = _make_identification(candidates, *NAMES[1])
+    state = condition_on(initial_state(changed, baseline), list(bias.components))
+    identifications = make_identifications((bias,), state, candidates, reasons)
+    null = null_scores(baseline, chance)
+    located = locate_mismatches(changed, baseline, null, level=0.005)
+    explained = attribute_mismatches(
+        located,
+        [bias],
+        changed,
+        predict_baseline(identifications, baseline),
+        null,
+        level=0.005,
+        without=lambda out: predict_baseline(identifications, baseline, left_out=out),
+    )
+    after = [
+        names
+        for region, names in zip(located, explained, strict=True)
+        if region["view"] == "restart" and region["begin"] >= lost - 20.0
+    ]
+    assert after
+    assert all(names == ["vibration_rectification"] for names in after)
