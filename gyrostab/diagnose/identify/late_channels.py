@@ -88,9 +88,9 @@ class _Delay(NamedTuple):
 
 def _may_follow_channel(selection: Selection) -> bool:
     """Return whether a selection has a course in time that no channel gives."""
+    statistics = [component.statistic for component in selection.components]
     return not any(selection.driver) and not any(
-        component.statistic.is_count or component.statistic.is_line
-        for component in selection.components
+        statistic.is_count or statistic.is_line or statistic.is_pairwise for statistic in statistics
     )
 
 
