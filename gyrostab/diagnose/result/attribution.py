@@ -112,8 +112,8 @@ def attribute_mismatches(
     statistic. If the baseline with the effects contains what the effect does there, two more
     conditions apply: the mismatch is gone with that baseline, or nearly so, and this effect is
     needed for that. A mismatch of the mean, or at a restart, may also lie before or after the
-    effect, when the effect causes the difference. In blocks within which an effect moves the rate, power and the lowest
-    lines exceed the noise; the effect explains these too.
+    effect, when the effect causes the difference. In blocks within which an effect moves the rate,
+    power and the lowest lines exceed the noise; the effect explains these too.
 
     `after` is the baseline with the effects, and `without` returns that except for those given, at
     the sizes of the joint fit. Without it, every effect at the place of a mismatch explains it.
