@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
@@ -28,6 +29,7 @@ _PARTS = 16
 _MIN_RECORD_DELAYS = 6
 #: Delays too large for a clock with which the best one is compared; limits the time.
 _MAX_OTHER_DELAYS = 64
+_QUANTILES = 1000  # of the largest value at those delays
 Array = NDArray[np.float64]
 
 
@@ -46,11 +48,9 @@ def find_late_channel(
     what explains the rates without a channel.
 
     A channel that has nothing to do with the rates explains as much at delays that are too large
-    for a clock, round the record. Evidence by chance has an exponential tail, as half of a
-    chi-square: the largest of n values at such delays is the scale of the tail times ln n, and
-    one of m values in the range exceeds the scale times ln(m / p) with the probability p. Delays at
-    which the channel resembles itself do not count; a smooth channel has no others, and stays.
-    Channels in `moved` stay too. None if there is no late channel.
+    for a clock, round the record (`chance_of_best`). Delays at which the channel resembles itself
+    do not count; a smooth channel has no others, and stays. Channels in `moved` stay too. None if
+    there is no late channel.
     """
     settings, blocks = examination.settings, examination.start.blocks
     unexplained = [
@@ -84,6 +84,24 @@ class _Delay(NamedTuple):
     nats: float
     parts: int  # parts of a block by which the channel is late
     channel: str
+
+
+def chance_of_best(ratio: float, count: int, others: int) -> float:
+    """Return the probability that the best of `count` values is so much larger than of `others`.
+
+    The values are squares of independent normal deviates with one unknown standard deviation, as
+    twice the evidence of a channel that has nothing to do with the rates. `ratio` is that of the
+    largest ones.
+
+    Examples
+    --------
+    >>> round(chance_of_best(1.0, 64, 64), 2), round(chance_of_best(2.4, 120, 64), 2)
+    (0.5, 0.04)
+    """
+    middle = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
+    largest = ndtri((1.0 + middle ** (1.0 / others)) / 2.0)
+    below = 2.0 * ndtr(math.sqrt(ratio) * largest) - 1.0
+    return float(np.mean(1.0 - below**count))
 
 
 def _may_follow_channel(selection: Selection) -> bool:
@@ -138,10 +156,9 @@ class _Search:
             return False
         number = min(shifts.size, _MAX_OTHER_DELAYS)
         shifts = shifts[np.linspace(0, shifts.size - 1, number).astype(int)]
-        chance = self.evidence(best.channel, parts, best.parts + shifts, wrap=True).max()
-        return bool(
-            best.nats * math.log(number) > chance * math.log(count / settings.surrogate_share)
-        )
+        nats = self.evidence(best.channel, parts, best.parts + shifts, wrap=True).max()
+        ratio = best.nats / max(float(nats), 1.0)
+        return chance_of_best(ratio, count, number) <= settings.surrogate_share
 
     def parts(self, channel: str) -> Array:
         """Return the channel in parts of the blocks; the mean square where the rms matters."""

@@ -18,6 +18,7 @@ MAX_UNRELATED_LINES = 3
 #: Family of the lines of a shaped spectrum.
 UNRELATED = "lines without a common spacing"
 #: Largest multiple of the spacing that defines a family: of its lowest line, or between two lines.
+#: Design choice: the chance of a family counts those that are tried.
 _MAX_LOWEST_HARMONIC = 4
 _MAX_APART = 3  # places between two lines that define a spacing; limits time
 #: Distance allowed about a multiple, in spacings; with more, most unrelated lines are at one.

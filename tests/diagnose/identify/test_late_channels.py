@@ -11,7 +11,7 @@ import xarray as xr
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify.examination import Examination, prepare_examination
 from gyrostab.diagnose.identify.identification import Identifications
-from gyrostab.diagnose.identify.late_channels import find_late_channel
+from gyrostab.diagnose.identify.late_channels import chance_of_best, find_late_channel
 from gyrostab.diagnose.identify.selection import identify_effects
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.schema.delays import move_channels
@@ -89,6 +89,19 @@ def test_channel_that_does_not_explain_more_stays(
     effects: list[dict[str, Any]], delay: float, world: tuple[dict[str, Any], ...]
 ) -> None:
     assert find_late_channel(*examined(recorded(effects, delay, world=world))) is None
+
+
+@pytest.mark.parametrize(("count", "others"), [(60, 20), (120, 64), (300, 40)])
+def test_chance_holds_its_level_on_values_of_unknown_scale(count: int, others: int) -> None:
+    rng = np.random.default_rng(8)
+    best, compared = (
+        np.square(rng.standard_normal((2_000, size))).max(axis=1) for size in (count, others)
+    )
+    chance = [chance_of_best(ratio, count, others) for ratio in best / compared]
+    for level in (0.05, 0.2):  # two and a half standard errors
+        assert np.mean(np.array(chance) <= level) == pytest.approx(
+            level, abs=2.5 * np.sqrt(level / 2_000)
+        )
 
 
 @pytest.mark.slow
