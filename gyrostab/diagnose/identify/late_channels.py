@@ -44,13 +44,13 @@ def find_late_channel(
 
     A channel is moved only to explain what no channel explains at its own time. All delays of all
     channels are equally probable, so that the evidence of the best one must exceed the threshold,
-    and that of the channel at its own time, by the logarithm of their number. It must also exceed
-    what explains the rates without a channel.
+    and that of the channel at its own time, by the logarithm of their number. A smooth channel
+    explains about as much at its own time, and stays. The evidence must also exceed that of what
+    explains the rates without a channel.
 
     A channel that has nothing to do with the rates explains as much at delays that are too large
     for a clock, round the record (`chance_of_best`). Delays at which the channel resembles itself
-    do not count; a smooth channel has no others, and stays. Channels in `moved` stay too. None if
-    there is no late channel.
+    do not count. Channels in `moved` stay. None if there is no late channel.
     """
     settings, blocks = examination.settings, examination.start.blocks
     unexplained = [
@@ -64,7 +64,7 @@ def find_late_channel(
     if not unexplained or reach == 0 or not channels:
         return None
     explained = [effect for effect in identifications.identified if effect not in unexplained]
-    search = _Search(examination, examination.state_with(explained), baseline, log, reach)
+    search = DelaySearch(examination, examination.state_with(explained), baseline, log, reach)
     best = search.find_best(channels)
     count = 2 * reach * len(channels)
     on_time_nats = float(search.evidence(best.channel, search.parts(best.channel), [0])[0])
@@ -78,7 +78,7 @@ def find_late_channel(
     return best.channel, float(f"{best.parts * block_s / _PARTS:.4g}")
 
 
-class _Delay(NamedTuple):
+class Delay(NamedTuple):
     """A delay of a channel, and the evidence of the effect that then follows it best."""
 
     nats: float
@@ -113,7 +113,7 @@ def _may_follow_channel(selection: Selection) -> bool:
 
 
 @dataclass(frozen=True)
-class _Search:
+class DelaySearch:
     """The record in which channels are moved."""
 
     examination: Examination
@@ -122,18 +122,18 @@ class _Search:
     log: xr.Dataset
     reach: int  # blocks in the largest delay of a clock
 
-    def find_best(self, channels: Iterable[str]) -> _Delay:
+    def find_best(self, channels: Iterable[str]) -> Delay:
         """Return the delay of whole blocks with the most evidence, of any channel."""
         shifts = _PARTS * np.delete(np.arange(-self.reach, self.reach + 1), self.reach)
         return max(
-            _Delay(float(nats), int(shift), channel)
+            Delay(float(nats), int(shift), channel)
             for channel in channels
             for shift, nats in zip(
                 shifts, self.evidence(channel, self.parts(channel), shifts), strict=True
             )
         )
 
-    def refine(self, best: _Delay) -> _Delay:
+    def refine(self, best: Delay) -> Delay:
         """Return the best delay near another one, to a part of a block."""
         parts, step = self.parts(best.channel), _PARTS
         while step > 1:
@@ -143,7 +143,7 @@ class _Search:
             best = best._replace(nats=float(nats.max()), parts=int(shifts[nats.argmax()]))
         return best
 
-    def exceeds_chance(self, best: _Delay, count: int) -> bool:
+    def exceeds_chance(self, best: Delay, count: int) -> bool:
         """Test whether the best of `count` delays explains more than delays that no clock has.
 
         False if the channel resembles itself at most of them.

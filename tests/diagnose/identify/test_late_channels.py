@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,9 +13,16 @@ import xarray as xr
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify.examination import Examination, prepare_examination
 from gyrostab.diagnose.identify.identification import Identifications
-from gyrostab.diagnose.identify.late_channels import chance_of_best, find_late_channel
+from gyrostab.diagnose.identify.late_channels import (
+    Array,
+    Delay,
+    DelaySearch,
+    chance_of_best,
+    find_late_channel,
+)
 from gyrostab.diagnose.identify.selection import identify_effects
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.schema.delays import move_channels
 from gyrostab.simulate import simulate
 from tests.support.named import nulls
@@ -102,6 +111,28 @@ def test_chance_holds_its_level_on_values_of_unknown_scale(count: int, others: i
         assert np.mean(np.array(chance) <= level) == pytest.approx(
             level, abs=2.5 * np.sqrt(level / 2_000)
         )
+
+
+class DrawnSearch(DelaySearch):
+    """A channel of which the evidence at other delays is given."""
+
+    def parts(self, channel: str) -> Array:
+        return np.random.default_rng(4).standard_normal(90 * 16)
+
+    def evidence(
+        self, channel: str, parts: Array, shifts: Iterable[int], *, wrap: bool = False
+    ) -> Array:
+        return np.full(len(list(shifts)), {"unrelated": 40.0}.get(channel, 10.0))
+
+
+@pytest.mark.parametrize(("channel", "is_late"), [("related", True), ("unrelated", False)])
+def test_late_channel_explains_more_than_at_other_delays(channel: str, is_late: bool) -> None:
+    blocks = xr.Dataset(coords={"block": np.arange(90)})
+    start = SimpleNamespace(blocks=blocks)
+    examination: Any = SimpleNamespace(settings=DEFAULTS, start=start)
+    state: Any = None
+    search = DrawnSearch(examination, state, blocks, blocks, reach=15)
+    assert search.exceeds_chance(Delay(50.0, 48, channel), count=60) is is_late
 
 
 @pytest.mark.slow
