@@ -11,11 +11,11 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.core import diagnose
+from gyrostab.diagnose.identify import late_channels
 from gyrostab.diagnose.identify.examination import Examination, prepare_examination
 from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.identify.late_channels import (
     Array,
-    Delay,
     DelaySearch,
     chance_of_best,
     find_late_channel,
@@ -113,26 +113,49 @@ def test_chance_holds_its_level_on_values_of_unknown_scale(count: int, others: i
         )
 
 
-class DrawnSearch(DelaySearch):
-    """A channel of which the evidence at other delays is given."""
+@pytest.mark.parametrize(
+    ("on_time", "elsewhere", "without_channel", "best", "is_late"),
+    [
+        (0.0, 5.0, 20.0, 60.0, True),
+        (55.0, 5.0, 20.0, 60.0, False),  # hardly more than at its own time
+        (0.0, 40.0, 20.0, 60.0, False),  # hardly more than by chance
+        (0.0, 5.0, 65.0, 60.0, False),  # less than without a channel
+        (0.0, 0.5, 5.0, 12.0, False),  # 30 delays of 16 parts are worth 6.2 nats
+    ],
+)
+def test_late_channel_explains_more_than_all_else(
+    on_time: float,
+    elsewhere: float,
+    without_channel: float,
+    best: float,
+    is_late: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The evidence of each delay is given."""
 
-    def parts(self, channel: str) -> Array:
-        return np.random.default_rng(4).standard_normal(90 * 16)
+    class GivenEvidence(DelaySearch):
+        def parts(self, channel: str) -> Array:
+            return np.random.default_rng(4).standard_normal(90 * 16)
 
-    def evidence(
-        self, channel: str, parts: Array, shifts: Iterable[int], *, wrap: bool = False
-    ) -> Array:
-        return np.full(len(list(shifts)), {"unrelated": 40.0}.get(channel, 10.0))
+        def evidence(
+            self, channel: str, parts: Array, shifts: Iterable[int], *, wrap: bool = False
+        ) -> Array:
+            peak = np.maximum(best - np.abs(np.array(list(shifts)) - 48.0), 0.0)
+            peak[np.array(list(shifts)) == 0] = on_time
+            return np.full(peak.size, elsewhere) if wrap else peak
 
-
-@pytest.mark.parametrize(("channel", "is_late"), [("related", True), ("unrelated", False)])
-def test_late_channel_explains_more_than_at_other_delays(channel: str, is_late: bool) -> None:
-    blocks = xr.Dataset(coords={"block": np.arange(90)})
-    start = SimpleNamespace(blocks=blocks)
-    examination: Any = SimpleNamespace(settings=DEFAULTS, start=start)
-    state: Any = None
-    search = DrawnSearch(examination, state, blocks, blocks, reach=15)
-    assert search.exceeds_chance(Delay(50.0, 48, channel), count=60) is is_late
+    blocks = xr.Dataset({"channel_vibration": ("block", np.zeros(90))}, attrs={"block_s": 10.0})
+    examination: Any = SimpleNamespace(
+        settings=DEFAULTS,
+        start=SimpleNamespace(blocks=blocks),
+        threshold=9.0,
+        state_with=lambda selections: None,
+    )
+    unexplained = SimpleNamespace(driver=(), components=(), evidence_nats=without_channel)
+    identifications: Any = SimpleNamespace(identified=(), unknown=(unexplained,))
+    monkeypatch.setattr(late_channels, "DelaySearch", GivenEvidence)
+    found = find_late_channel(examination, identifications, blocks, blocks)
+    assert found == (("vibration", 30.0) if is_late else None)
 
 
 @pytest.mark.slow
