@@ -130,7 +130,7 @@ def _remove_random_biases(identifications: Identifications) -> tuple[Identificat
 def remove_phase_locked(
     identifications: Identifications, blocks: xr.Dataset
 ) -> tuple[Identifications, float]:
-    """Drop phase-locked components and slow sines, and return their held-out evidence [nats].
+    """Drop phase-locked components and sines, and return their evidence [nats].
 
     The band powers show how large such a component is, but not its phase. In them it would gain a
     small part of its evidence, and lose in every band that it leaves. Therefore its own statistic
@@ -194,8 +194,8 @@ def held_out(
         ``cross`` (pair, block, band).
     more_gain : float
         Held-out gain [nats] of what is in neither means nor powers nor cross-spectra, to be added:
-        sample counts, phase-locked components, random biases. Lines are in the powers of their
-        bands already and would count twice.
+        sample counts, phase-locked components, random biases. Lines whose phase wanders are in the
+        powers of their bands already and would count twice.
     shown : callable
         The same with all effects, those of `more_gain` included, for the Allan variance.
     forecast : callable

@@ -53,7 +53,6 @@ from gyrostab.kernels.spectra.line_levels import LEAK_LINES, local_level
 _WIDTH_LINES = 5  # of a line with its leakage
 _CERTAIN_SIGMA = 3.0  # by which the power of a line varies more than that of noise; design choice
 _MAX_COHERENCE_BLOCKS = 3.0  # longest coherence time that the scatter of block powers determines
-_SLOW_CYCLES = 2.0  # in a block, below which slow noise has the power of a sine; design choice
 _AROUND_LINES = 40  # lines on either side that define the level; design choice
 
 
@@ -174,17 +173,12 @@ class SpectralLine(Statistic):
         return power, [], []
 
     def is_only_in_phase(self, component: Component, blocks: xr.Dataset) -> bool:
-        """Return whether the component is a sine below two cycles a block, of constant phase.
+        """Return whether the component is a sine of constant phase.
 
-        In the lowest bands, the slow noise is fitted to its power.
+        The powers of bands show little of it, and slow noise is fitted to that of a slow one.
         """
         axis_blocks, place = blocks.sel(axis=component.row[0]), component.place
-        return (
-            place >= 0
-            and _has_constant_phase(axis_blocks, place)
-            and float(axis_blocks["sine_frequency"][place])
-            < _SLOW_CYCLES / float(blocks.attrs["block_s"])
-        )
+        return place >= 0 and _has_constant_phase(axis_blocks, place)
 
     def estimate(self, fit: SizeFit) -> Sizes:
         """Estimate amplitudes and the frequency, from the power about the line.

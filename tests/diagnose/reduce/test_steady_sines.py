@@ -157,19 +157,21 @@ def test_weak_sine_is_named_with_frequency_and_amplitude():
     assert abs(frequency - 1.7321) < 2.0 * error < 0.002
 
 
-@pytest.mark.parametrize(("frequency", "slow"), [(0.0721, True), (0.1543, False)])
-def test_a_slow_sine_counts_by_its_phase(frequency, slow):
-    """Slow noise is fitted to the power of a sine below two cycles a block."""
-    noise = np.random.default_rng(5).standard_normal((1, SIZE))
-    noise += wave(frequency, np.sqrt(4.0 * 60.0 / SIZE))
+@pytest.mark.parametrize("is_steady", [True, False])
+def test_a_sine_counts_by_its_phase_if_that_is_constant(is_steady: bool) -> None:
+    rng = np.random.default_rng(5)
+    noise = rng.standard_normal((1, SIZE))
+    turns = 0.0 if is_steady else np.cumsum(rng.standard_normal(SIZE)) / np.sqrt(SIZE / 100.0)
+    phase = 2.0 * np.pi * 0.1543 * np.arange(SIZE) / RATE + turns
+    noise += np.sqrt(4.0 * (60.0 if is_steady else 600.0) / SIZE) * np.sin(phase)
     blocks = reduce_log(make_log(noise, rate=RATE, unit="deg/h", axis=["x"]))
-    place = int(blocks["sine_nats"].values[0].argmax())
+    place = round(0.1543 / float(blocks["line_frequency"][0])) - 1
     line = find_statistic("spectral_line")
     variant = Variant({}, ("amplitude",), np.empty(0), squared=True)
     component = Component(
         Candidate("spectral_line", line, (), (variant,)), variant, ("x",), 50.0, place
     )
-    assert line.is_only_in_phase(component, blocks) is slow
+    assert line.is_only_in_phase(component, blocks) is is_steady
 
 
 def test_blocks_longer_than_a_segment_have_no_search():
