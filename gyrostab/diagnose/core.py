@@ -144,21 +144,21 @@ def _run_steps(task: Task, block: Any) -> Diagnosis:
 
 def _identify_with_late_channels(task: Task, block: Any) -> tuple[Task, NamedBlocks]:
     """Steps 1 to 4; again with a channel moved in time if that explains more, each channel once."""
-    model = task.simulation
-    delays = dict(model.delay) if isinstance(model, Model) else {}
-    current, named = _identify_with_delays(task, block, delays)
+    known = task.simulation.delay if isinstance(task.simulation, Model) else {}
+    delays = {name: delay_s for name, delay_s in known.items() if name in task.log}
+    reduced, named = _identify_with_delays(task, block, delays)
     while late := find_late_channel(
-        named.examination, named.identifications, named.baseline, current.log, delays
+        named.examination, named.identifications, named.baseline, reduced.log, delays
     ):
         channel, delay_s = late
         tried = {**delays, channel: delay_s}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # given above
-            moved = _identify_with_delays(task, block, tried)
-        if not any(channel in effect.driver for effect in moved[1].identifications.identified):
+            moved, renamed = _identify_with_delays(task, block, tried)
+        if not any(channel in effect.driver for effect in renamed.identifications.identified):
             break
-        delays, (current, named) = tried, moved
-    return current, named
+        delays, reduced, named = tried, moved, renamed
+    return reduced, named
 
 
 def _identify_with_delays(

@@ -50,7 +50,8 @@ def find_late_channel(
 
     A channel that has nothing to do with the rates explains as much at delays that are too large
     for a clock, round the record (`chance_of_best`). Delays at which the channel resembles itself
-    do not count. Channels in `moved` stay. None if there is no late channel.
+    do not count. Channels that an identified effect follows stay, and those in `moved`. None if
+    there is no late channel.
     """
     settings, blocks = examination.settings, examination.start.blocks
     unexplained = [
@@ -60,7 +61,8 @@ def find_late_channel(
     ]
     block_s = float(blocks.attrs["block_s"])
     reach = min(int(settings.max_delay_s / block_s), blocks.sizes["block"] // _MIN_RECORD_DELAYS)
-    channels = [name for name in channel_units(blocks) if name not in moved]
+    on_time = {name for effect in identifications.identified for name in effect.driver}
+    channels = [name for name in channel_units(blocks) if name not in on_time | {*moved}]
     if not unexplained or reach == 0 or not channels:
         return None
     explained = [effect for effect in identifications.identified if effect not in unexplained]

@@ -156,6 +156,9 @@ def test_late_channel_explains_more_than_all_else(
     monkeypatch.setattr(late_channels, "DelaySearch", GivenEvidence)
     found = find_late_channel(examination, identifications, blocks, blocks)
     assert found == (("vibration", 30.0) if is_late else None)
+    # another effect follows the channel at its own time
+    identifications.identified = (SimpleNamespace(driver=("vibration",), components=()),)
+    assert find_late_channel(examination, identifications, blocks, blocks) is None
 
 
 @pytest.mark.slow
