@@ -22,11 +22,12 @@ from gyrostab.simulate.turning import rotation
 from gyrostab.store.toml import parse_toml, read_toml_text
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.stamps import stamp_ns
+from gyrostab.units import DAY
 
 #: Largest noise coefficient: its square, and sums of squares, stay within the range of numbers.
 _MAX_COEFFICIENT = 1e100
 #: Largest bias [deg/h], and largest delay [s]: a day.
-_LARGEST = {"bias": _MAX_COEFFICIENT, "delay": 86400.0}
+_LARGEST = {"bias": _MAX_COEFFICIENT, "delay": DAY}
 
 #: Function of the environment -> (the function, unit of each number).
 PROFILES: dict[str, tuple[Callable[..., Any], dict[str, str]]] = {
