@@ -214,7 +214,7 @@ def _draw_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
             common = {"mode": "lines", "legendgroup": case, **shared}
             figure.add_scatter(
                 x=place, y=single(edge), fill="toself", line={"width": 0}, hoverinfo="skip",
-                fillcolor=f"{colour}2e",
+                fillcolor=colour, opacity=0.18,
                 **(common | {"showlegend": False}),
             )  # fmt: skip
             figure.add_scatter(

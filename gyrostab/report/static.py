@@ -119,7 +119,7 @@ def _draw_map(panel: Axes, times: NDArray[np.datetime64], trace: Any, scale: Any
 def _draw_scatter(panel: Axes, x: NDArray[Any], trace: Any) -> Any:
     """Draw a line, points or a band; return what the legend shows of it."""
     if trace.fill:
-        panel.fill(x, trace.y, color=trace.fillcolor, linewidth=0.0)
+        panel.fill(x, trace.y, color=trace.fillcolor, alpha=trace.opacity, linewidth=0.0)
         return None
     look = trace.marker if trace.mode == "markers" else trace.line
     (line,) = panel.plot(

@@ -181,6 +181,8 @@ def distance_to_range(sizes: Array, covariance: Array, low: Array, high: Array) 
     0.0
     """
     is_known = np.isfinite(np.diagonal(covariance))
+    if not is_known.any():
+        return 0.0
     sizes, low, high = sizes[is_known], low[is_known], high[is_known]
     covariance = covariance[np.ix_(is_known, is_known)]
     scale = np.sqrt(np.maximum(np.diagonal(covariance), np.finfo(float).tiny))

@@ -18,6 +18,7 @@ from gyrostab.diagnose.identify import identifiability
 from gyrostab.diagnose.identify.examination import prepare_examination
 from gyrostab.diagnose.identify.identifiability import (
     _is_possible,
+    distance_to_range,
     keep_physical,
     passes_time_shift_test,
 )
@@ -339,3 +340,11 @@ def test_line_has_evidence_only_at_its_frequency():
 
 def test_folds_of_all_lengths_are_used():
     assert len(subsets(120)) == 1 + 3 * FOLDS
+
+
+def test_sizes_of_infinite_error_may_have_any_value() -> None:
+    sizes, limit = np.array([300.0, -2.0]), np.full(2, 20.0)
+    unknown = np.diag([np.inf, np.inf])
+    assert distance_to_range(sizes, unknown, -limit, limit) == 0.0
+    half_known = np.diag([np.inf, 1.0])
+    assert distance_to_range(sizes, half_known, -limit, limit) == pytest.approx(0.0, abs=1e-6)
