@@ -45,6 +45,7 @@ from gyrostab.diagnose.task import (
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.convert import as_log
 from gyrostab.progress import Stage, no_stage
+from gyrostab.schema import log_channels
 from gyrostab.schema.delays import move_channels
 from gyrostab.simulate.model import Model
 
@@ -145,7 +146,8 @@ def _run_steps(task: Task, block: Any) -> Diagnosis:
 def _identify_with_late_channels(task: Task, block: Any) -> tuple[Task, NamedBlocks]:
     """Steps 1 to 4; again with a channel moved in time if that explains more, each channel once."""
     known = task.simulation.delay if isinstance(task.simulation, Model) else {}
-    delays = {name: delay_s for name, delay_s in known.items() if name in task.log}
+    channels = log_channels(task.log)
+    delays = {name: delay_s for name, delay_s in known.items() if name in channels}
     reduced, named = _identify_with_delays(task, block, delays)
     while late := find_late_channel(
         named.examination, named.identifications, named.baseline, reduced.log, delays

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
+from gyrostab.schema.checks import log_channels
 from gyrostab.time.grid import TimeGridIndex, time_coordinate
 from gyrostab.time.stamps import NANOSECONDS
 
@@ -20,7 +21,7 @@ def move_channels(log: xr.Dataset, delays: Mapping[str, float]) -> xr.Dataset:
         A log with its channels, in memory or lazy.
     delays : mapping
         Name of a channel -> by how much its stamps are late [s]; below zero they are early. Names
-        that the log does not have are ignored.
+        that are not those of channels are ignored.
 
     Returns
     -------
@@ -35,9 +36,9 @@ def move_channels(log: xr.Dataset, delays: Mapping[str, float]) -> xr.Dataset:
     >>> move_channels(log, {"temperature": 60.0})["time_temperature"].values[0]
     np.datetime64('2026-01-01T00:00:00.000000000')
     """
-    moved = log
+    moved, channels = log, log_channels(log)
     for name, delay_s in delays.items():
-        if name not in log:
+        if name not in channels:
             continue
         (dim,) = log[name].dims
         own, index = f"time_{name}", log.xindexes[dim]

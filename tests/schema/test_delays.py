@@ -15,7 +15,7 @@ from gyrostab.time.grid import TimeGridIndex
 
 @pytest.fixture
 def log() -> xr.Dataset:
-    """A log with a channel on its time, and one with uneven stamps of its own."""
+    """A log with a channel on its time, and another with separate, uneven stamps."""
     rates = da.zeros((2, 600), chunks=(2, 200))
     recorded = make_log(rates, rate=10.0, unit="deg/h", start="2026-03-14T08:00")
     stamps = recorded["time"].values[[3, 50, 51, 400]]
@@ -38,7 +38,7 @@ def test_stamps_are_earlier_by_the_delay(log: xr.Dataset, name: str, delay: floa
 
 
 def test_only_the_channel_changes(log: xr.Dataset) -> None:
-    moved = move_channels(log, {"temperature": 5.0, "pressure": 9.0})
+    moved = move_channels(log, {"temperature": 5.0, "pressure": 9.0, "rate": 2.0, "gap_end": 3.0})
     assert list(moved) == list(log)
     xr.testing.assert_identical(
         moved.drop_dims("time_temperature"), log.drop_dims("time_temperature")

@@ -17,19 +17,19 @@ from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identification import Identifications, Selection
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.windows import channel_units
-from gyrostab.diagnose.reduce.log_blocks import channel_means
+from gyrostab.diagnose.reduce.log_blocks import channel_means, is_rms_channel
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.schema.delays import move_channels
 from gyrostab.time.grid import grid_times
 
 #: Parts of a block in which a delay is resolved. Design choice.
 _PARTS = 16
-#: Blocks of the record in each block of the largest delay: most delays have to be too large for a
-#: clock, to be compared with.
+#: Least length of the record, in largest delays: a channel is also compared at delays that are too
+#: large for a clock, and these have to be most of them. Design choice.
 _MIN_RECORD_DELAYS = 6
 #: Delays too large for a clock with which the best one is compared; limits the time.
 _MAX_OTHER_DELAYS = 64
-_QUANTILES = 1000  # of the largest value at those delays
+_QUANTILES = 1000  # over which a probability is averaged; exact to 1e-3
 Array = NDArray[np.float64]
 
 
@@ -153,7 +153,7 @@ class DelaySearch:
         settings = self.examination.settings
         parts = self.parts(best.channel)
         shifts = _PARTS * np.arange(self.reach, parts.size // _PARTS - self.reach + 1)
-        shifts = shifts[np.abs(_correlations(parts, shifts)) <= settings.majority_share]
+        shifts = shifts[np.abs(_correlate_with_itself(parts, shifts)) <= settings.majority_share]
         if shifts.size < settings.min_surrogates:
             return False
         number = min(shifts.size, _MAX_OTHER_DELAYS)
@@ -172,8 +172,8 @@ class DelaySearch:
             np.arange(count * _PARTS + 1) * samples // _PARTS,
         )
         with_stamps = move_channels(self.log, {channel: 0.0})
-        means = channel_means(with_stamps, channel, edges, rms=_is_rms(channel))
-        return means**2 if _is_rms(channel) else means
+        means = channel_means(with_stamps, channel, edges, rms=is_rms_channel(channel))
+        return means**2 if is_rms_channel(channel) else means
 
     def evidence(
         self, channel: str, parts: Array, shifts: Iterable[int], *, wrap: bool = False
@@ -193,7 +193,7 @@ class DelaySearch:
             good = np.isfinite(in_parts).reshape(-1, _PARTS)
             sums = np.nansum(in_parts.reshape(-1, _PARTS), axis=1)
             means = sums / np.where(good.any(axis=1), good.sum(axis=1), np.nan)
-            values = np.sqrt(means) if _is_rms(channel) else means
+            values = np.sqrt(means) if is_rms_channel(channel) else means
             candidates, _ = effect_candidates(
                 blocks.assign({name: ("block", values, blocks[name].attrs)}),
                 self.baseline["coefficient"],
@@ -210,13 +210,9 @@ class DelaySearch:
         return np.array(best)
 
 
-def _correlations(parts: Array, shifts: NDArray[np.int64]) -> Array:
+def _correlate_with_itself(parts: Array, shifts: NDArray[np.int64]) -> Array:
     """Return the correlations of a channel with itself, moved round the record by parts."""
     centred = np.nan_to_num(parts - np.nanmean(parts))
     spectrum = np.abs(np.fft.rfft(centred)) ** 2
     products = np.fft.irfft(spectrum, centred.size)
     return np.asarray(products[shifts % centred.size] / products[0])
-
-
-def _is_rms(channel: str) -> bool:
-    return channel.startswith("vibration")

@@ -15,7 +15,7 @@ from gyrostab.diagnose.reduce.accumulate import (
     RAMP_PHASE_BINS,
     Accumulator,
 )
-from gyrostab.diagnose.reduce.log_blocks import channel_means, numeric_channels
+from gyrostab.diagnose.reduce.log_blocks import channel_means, is_rms_channel, numeric_channels
 from gyrostab.diagnose.reduce.outliers import count_outliers, quantization_step, zeros_beyond_chance
 from gyrostab.diagnose.reduce.rotation_orders import HARMONICS
 from gyrostab.diagnose.reduce.schema import COORDINATES, label_variables, weighted_mean
@@ -193,7 +193,7 @@ def _channel_means(
     on_log_time, on_own_time = numeric_channels(log)
     edges = grid_times(work.start, work.rate, np.arange(work.block_count + 1) * work.length)
     for name in (*on_log_time, *on_own_time):
-        rms = name.startswith("vibration")
+        rms = is_rms_channel(name)
         if name in on_log_time:
             mean, spread = np.moveaxis(
                 by_name["moments"][work.axes + on_log_time.index(name), :, :2], -1, 0

@@ -106,6 +106,11 @@ def _split_at_chunks(signal: Any, rows: int) -> Iterator[tuple[int, int]]:
         yield low, high
 
 
+def is_rms_channel(name: str) -> bool:
+    """Return whether a channel enters blocks by its root mean square, not by its mean."""
+    return name.startswith("vibration")
+
+
 def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: bool) -> Array:
     """Average a channel with its own time stamps over intervals, interpolating empty intervals.
 
