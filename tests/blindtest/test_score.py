@@ -347,6 +347,8 @@ def test_table_of_known_scores():
     ]
     withheld = truth("shupe", kind="degraded_driver", degradation="withheld", index=700)
     rows += score_case(diagnosis(identification("supply_bias")), withheld)
+    withheld = truth("shupe", kind="degraded_driver", degradation="withheld", index=701)
+    rows += score_case(diagnosis(identification("telegraph") | {"probability": 0.4}), withheld)
     table = score_table(rows).set_index("quantity")
     assert table.loc["false alarms: effect named on a null record", ["value", "n"]].tolist() == [
         0.0,
@@ -361,6 +363,8 @@ def test_table_of_known_scores():
         "not shown",
     ]  # too few cases
     assert table.loc["driver withheld or substituted: wrong name", "value"] == 1.0
+    confident = "driver withheld or substituted: wrong name with a probability of 0.5 or more"
+    assert table.loc[confident, "value"] == 0.5
     assert table.loc["overlap in time (IoU), median", "value"] == 1.0
     assert table.loc["evidence relative to the oracle, median", "value"] == pytest.approx(0.95)
     learned = table.loc["evidence relative to the oracle with fitted noise, median", "value"]
@@ -606,7 +610,7 @@ def test_failed_diagnosis_counts_against_detection_only():
     assert table.loc["failed diagnoses", ["value", "n"]].tolist() == [1.0, 4]
     assert table.loc["detected, strength 1.5 or more", ["value", "n"]].tolist() == [0.0, 1]
     absent = table.filter(regex="wrong name|false alarms: |any mismatch", axis=0)
-    assert len(absent) == 6
+    assert len(absent) == 7
     assert set(absent["n"]) == {0}
     copies = injection_rows(injected=["shupe"])
     for failed, others in (("injected", 0), ("flipped", 0), (None, 1)):

@@ -88,6 +88,10 @@ def _flag_effect(row: Row) -> dict[str, bool]:
         "failed": bool(row.get("failed")),
         "answered": not row.get("failed"),
         "named": bool(row.get("named")),
+        "confidently_wrong": any(
+            not entry["right"] and (entry["probability"] or 0.0) >= 0.5
+            for entry in row["identifications"]
+        ),
         "null": kind == "null",
         "catalogue": in_catalogue,
         "clear": in_catalogue and is_strong,
