@@ -14,7 +14,7 @@ export PYTHONDONTWRITEBYTECODE =
 # One file of tests stays on one worker, with what its tests share; files start in their order.
 PYTEST := -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo docs test test-diagnoses test-install test-full test-minimum fuzz lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
+.PHONY: demo docs test test-slow test-install test-full test-minimum fuzz lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*## /\t/' | expand -t 18
@@ -38,7 +38,7 @@ demo: $(VENV)/.installed  ## install, and run the main job on the shipped log, a
 test: $(VENV)/.installed-test  ## install, and run the tests
 	$(BIN)/python $(PYTEST)
 
-test-diagnoses: $(VENV)/.installed-test  ## the whole diagnoses, the statistics and the reports in Chromium that make test leaves out
+test-slow: $(VENV)/.installed-test  ## the tests marked slow, which make test leaves out: whole records, statistics, killed processes, reports in Chromium
 	$(BIN)/python $(PYTEST) -m "slow and not full" tests
 
 test-install: $(VENV)/.installed-test  ## the README in a fresh checkout, and the wheel in a bare environment

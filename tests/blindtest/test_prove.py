@@ -261,6 +261,7 @@ def test_resumed_run_equals_an_uninterrupted_one(finished, small, tmp_path, monk
     assert (folder / "scores.csv").read_bytes() == (unbroken / "scores.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_failed_diagnosis_is_reported_and_retried(small, tmp_path, monkeypatch):
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: 1 / 0)
     proof = gyrostab.prove(tmp_path / "proof", cases=2, seed=9, nulls=100, workers=0)
@@ -335,6 +336,7 @@ class NamedAlways(NothingFound):
         return json.dumps(json.loads(super().to_json()) | {"effects": [effect]})
 
 
+@pytest.mark.slow
 def test_counterparts_count_as_noise_and_in_no_other_figure(small, tmp_path, monkeypatch):
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: NamedAlways())
     proof = gyrostab.prove(
@@ -358,6 +360,7 @@ def test_counterparts_count_as_noise_and_in_no_other_figure(small, tmp_path, mon
         gyrostab.prove(tmp_path / "proof", counterparts=4, resume=True)
 
 
+@pytest.mark.slow
 def test_run_of_an_earlier_version_is_scored_again(finished, small, tmp_path):
     before, _, _ = finished
     folder = shutil.copytree(before, tmp_path / "proof")
@@ -551,6 +554,7 @@ def test_broken_run_can_be_replaced(finished, tmp_path, break_off):
     assert {path.name for path in folder.rglob("*") if path.is_file()} == {"lock", "benchmark.json"}
 
 
+@pytest.mark.slow
 def test_overwrite_replaces_the_run(small, tmp_path, monkeypatch):
     monkeypatch.setattr(diagnosing, "diagnose", lambda *log, **options: 1 / 0)
     first = gyrostab.prove(tmp_path / "proof", cases=1, seed=1, workers=0)
@@ -585,6 +589,7 @@ def test_command_warns_of_a_tuning_seed(tmp_path, capfd):
 # processes
 
 
+@pytest.mark.slow
 def test_processes_keep_order_and_use_one_thread():
     counts: list[int] = []
     before = os.environ.get("OMP_NUM_THREADS")
@@ -596,6 +601,7 @@ def test_processes_keep_order_and_use_one_thread():
     assert os.environ.get("OMP_NUM_THREADS") == before
 
 
+@pytest.mark.slow
 def test_dead_process_raises_worker_error():
     with pytest.raises(WorkerError, match="--resume"):
         run_in_processes(os._exit, [(1,)], workers=1)

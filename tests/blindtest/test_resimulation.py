@@ -102,6 +102,7 @@ def noise_alone() -> xr.Dataset:
     return recording_of()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "effect", EFFECTS, ids=lambda effect: f"{effect['name']} {effect.get('fill', '')}".strip()
 )
@@ -118,6 +119,7 @@ def test_model_is_compared_with_records_of_its_own(noise_alone: xr.Dataset):
         assert check == {"runs": True, "nats": nats_of(recording, EFFECTS[0])}
 
 
+@pytest.mark.slow
 def test_an_effect_that_replaces_noise_is_not_nearer_than_the_calibrated_noise(
     noise_alone: xr.Dataset,
 ):
@@ -169,6 +171,7 @@ EASIER_MODELS: list[tuple[dict[str, Any], dict[str, Any]]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "wrong"),
     [*WRONG_MODELS, *(pytest.param(*pair, marks=pytest.mark.full) for pair in EASIER_MODELS)],

@@ -258,6 +258,7 @@ def test_record_without_a_whole_window_gets_no_advice_on_the_window(tmp_path, ca
     assert "the window is" not in shown
 
 
+@pytest.mark.slow
 def test_full_standard_output_is_explained(log):
     if not Path("/dev/full").exists():
         pytest.skip("this system has no /dev/full")

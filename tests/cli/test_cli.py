@@ -337,6 +337,7 @@ def test_an_interrupt_while_the_program_loads_is_exit_code_3(monkeypatch, capsys
     assert "interrupted" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -402,6 +403,7 @@ def test_a_long_stage_has_lines_of_progress(monkeypatch, capsys):
     ]
 
 
+@pytest.mark.slow
 def test_progress_is_a_bar_on_a_terminal(log, tmp_path):
     leader, follower = pty.openpty()
     arguments = ["run", str(log), "-o", str(tmp_path / "out.nc"), *WINDOW]

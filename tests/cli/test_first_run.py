@@ -45,6 +45,7 @@ print(hashlib.sha256(b"".join(part.tobytes() for part in found)).hexdigest())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "code", [TREND, pytest.param(FIT, marks=pytest.mark.full)], ids=["small", "large"]
 )
@@ -83,6 +84,7 @@ assert not track.stats.cache_path
 """
 
 
+@pytest.mark.slow
 def test_kernels_work_where_nothing_can_be_cached() -> None:
     subprocess.run([sys.executable, "-c", NO_FOLDER + TRACK], check=True)
 

@@ -26,6 +26,7 @@ def simulate_log(seed: int, *sizes: float):
     return simulate(model, duration="25min", rate=10.0, seed=seed).compute()
 
 
+@pytest.mark.slow
 def test_same_model_has_no_mismatch():
     diagnosis = gyrostab.diagnose(simulate_log(2), simulation=simulate_log(1), nulls=100)
     assert diagnosis.verdict == "no mismatch"

@@ -406,6 +406,7 @@ def test_counts_stay_counts_where_all_logs_have_the_same_factor() -> None:
     assert not join(first, second).rate.encoding
 
 
+@pytest.mark.slow
 def test_two_hundred_logs_open_without_being_read() -> None:
     values = signal(200 * 300)
     logs = cut(values, *((a, a + 302) for a in range(0, 200 * 300, 300)))

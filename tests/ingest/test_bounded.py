@@ -341,6 +341,7 @@ def write_wide_csv(path: Path, header: str, columns: int) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("header", "channels"), [("c{} [V]", 200), ("c{}", 0), ("c", 0)])
 def test_table_of_20_000_columns_is_read_for_those_that_are_used(
     header: str, channels: int, tmp_path: Path

@@ -161,6 +161,7 @@ def test_stamps_that_xarray_changed_are_read(tmp_path, form, change):
         assert back.time.values[[0, -1]].tolist() == changed.time.values[[0, -1]].tolist()
 
 
+@pytest.mark.slow
 def test_stamps_of_a_log_in_parts_take_no_memory(tmp_path):
     """A lazy log is written with stamps in a process whose memory holds few of them."""
     code = (

@@ -155,6 +155,7 @@ def _what_a_worker_knows():
     return list(sys.modules), threads
 
 
+@pytest.mark.slow
 def test_zarr_store_and_text_on_workers(address, tmp_path):
     small = _log().isel(time=slice(0, 30_000))
     store = to_zarr(small, tmp_path / "log.zarr")
@@ -339,6 +340,7 @@ def test_a_part_that_kills_every_worker_is_explained(address):
         list(run_calls(pool, [(os._exit, 3)]))
 
 
+@pytest.mark.slow
 def test_worker_processes_end_with_a_killed_parent(tmp_path):
     code = (
         "import os, signal\n"
@@ -364,6 +366,7 @@ def test_worker_processes_end_with_a_killed_parent(tmp_path):
     pytest.fail("the worker lives on")
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
     cluster, log, whole, tmp_path, monkeypatch, capfd
 ):
@@ -399,6 +402,7 @@ def test_a_scheduler_that_dies_is_explained_and_resume_goes_on(
     assert [path.name for path in output.parent.iterdir()] == [output.name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_real", [False, pytest.param(True, marks=pytest.mark.full)])
 def test_a_fleet_whose_scheduler_dies_goes_on(tmp_path, monkeypatch, capfd, is_real):
     """The message says how many runs are done, and the same command computes the others.

@@ -422,6 +422,7 @@ def test_a_fleet_of_an_object_store_is_that_of_its_folder(memory, done, tmp_path
             xr.testing.assert_equal(remote, other)
 
 
+@pytest.mark.slow
 def test_a_fleet_of_an_object_store_is_brought_up_to_date(memory, tmp_path, computed, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     table = tmp_path / "files.parquet"
@@ -469,6 +470,7 @@ def test_what_a_fleet_does_not_do_at_addresses_is_said(archive, tmp_path, memory
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_fleet_is_written_to_an_object_store(archive, done, memory, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     output = "memory://results/fleet.zarr"
@@ -490,6 +492,7 @@ def test_a_fleet_is_written_to_an_object_store(archive, done, memory, tmp_path, 
     assert [path.name for path in tmp_path.iterdir()] == ["tool.csv"]
 
 
+@pytest.mark.slow
 def test_a_fleet_at_an_address_is_brought_up_to_date(memory, tmp_path, computed, monkeypatch):
     monkeypatch.chdir(tmp_path)
     own, output, table = tmp_path / "in", "memory://results/fleet.zarr", "memory://rig/all.parquet"
@@ -562,6 +565,7 @@ def test_an_interrupted_pool_does_not_wait_for_its_processes():
     assert time.monotonic() - begun < 50
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_killed_fleet_goes_on_where_it_was(tmp_path, computed):
     """Kill a call in its third run, with the product computed and not yet renamed."""

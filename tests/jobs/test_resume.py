@@ -425,6 +425,7 @@ def test_two_runs_of_one_output_at_once(log, tmp_path, capfd):
     assert call(log, "-o", output) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("calls", "kills"),
     [

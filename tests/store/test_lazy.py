@@ -235,6 +235,7 @@ def test_a_part_is_fitted_as_the_whole(options):
     )
 
 
+@pytest.mark.slow
 def test_worker_processes_tell_of_damage_as_threads_do(tmp_path):
     path = stored_logs(tmp_path, "zarr")[0]
     (path / "rate" / "1.0").unlink()

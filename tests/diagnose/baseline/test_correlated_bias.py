@@ -44,6 +44,7 @@ def _find_on_x(model: dict, seed: int, duration: str = "1h") -> CorrelatedBias:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "noise",
     [
@@ -59,6 +60,7 @@ def test_noise_shows_no_bias(noise):
     assert np.median(nats) < 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rms", "time", "count"),
     [
@@ -90,6 +92,7 @@ def test_a_bias_in_the_model_is_no_evidence_of_another():
     assert found.nats < 3.0
 
 
+@pytest.mark.slow
 def test_bands_of_lines_are_no_evidence_of_a_bias():
     """The lines are in the model, with powers of their own sizes; means alone have angle noise."""
     log = simulate(_make_model({"N": 0.003}), duration="40min", rate=10.0, seed=3).sel(axis=["x"])

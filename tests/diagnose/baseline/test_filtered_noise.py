@@ -28,6 +28,7 @@ def filtered_blocks(
     return reduce_log(make_log(rates, rate=RATE, unit="deg/h"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first_of(1, 2, 3))
 @pytest.mark.parametrize(
     "taps", [2, 8, *(pytest.param(taps, marks=pytest.mark.full) for taps in (1, 3, 4))]

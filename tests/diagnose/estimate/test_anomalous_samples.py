@@ -42,6 +42,7 @@ def named(table: dict, *, axes: str = "xyz", mean: float = 0.0, seed: int = 1) -
     return name_effects(blocks, baseline, records)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "options"),
     [
@@ -239,6 +240,7 @@ def test_instants_of_held_samples_are_compared_between_axes(number, span, step, 
     assert are_simultaneous(("x", "y"), "repeats", blocks, counts) == is_together
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", first_of(2, 20))
 def test_frames_that_are_sent_twice_are_held_samples(number: int) -> None:
     noise = SCATTER * np.random.default_rng(8).standard_normal((1, 15_000))
@@ -323,6 +325,7 @@ def test_limits_of_a_rate_that_moves_are_the_ends_of_the_record(is_two_sided):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "mark", "name", "size"),
     [
@@ -422,6 +425,7 @@ def test_spikes_of_six_sigma_are_identified_and_counted():
     assert 0.5 < fitted.parameters["size"].value / (6.0 * SCATTER) < 2.0
 
 
+@pytest.mark.slow
 def test_spikes_in_most_blocks_keep_their_size_and_power():
     rng = np.random.default_rng(11)
     hit = rng.random((1, 15_000)) < 0.009

@@ -28,6 +28,7 @@ def test_undetermined_cutoff_has_a_wide_interval() -> None:
     assert high > 3.0 * low
 
 
+@pytest.mark.slow
 def test_determined_cutoff_has_a_narrow_interval() -> None:
     raw = np.random.default_rng(3).standard_normal((2, 120_000))
     low, high = _cutoff_interval(

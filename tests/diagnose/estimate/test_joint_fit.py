@@ -78,6 +78,7 @@ def coverage(estimates, truth: float) -> float:
     return float(np.mean([estimate.low <= truth <= estimate.high for estimate in estimates]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "power"),
     [
@@ -103,6 +104,7 @@ def test_intervals_of_rectification_hold_the_true_value(noise_only, size, power)
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.2, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_intervals_of_vibration_noise_hold_the_true_value(noise_only, share):
     g = noise_only[0]["channel_vibration"].values

@@ -59,6 +59,7 @@ def fit_effect(noise_only, effect, statistic, column, *, true, size, named):
     return fitted
 
 
+@pytest.mark.slow
 def test_undetermined_lag_is_zero_and_widens_the_size(noise_only):
     truth = 0.01
     fitted = fit_effect(

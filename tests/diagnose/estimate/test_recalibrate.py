@@ -141,6 +141,7 @@ def test_noise_belongs_to_the_exponent_in_the_model():
     assert abs(value - 0.003) < 3.0 * error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [0.0, 0.3])
 def test_lines_in_most_bands_leave_the_noise_between_them(lost):
     """The power of a steady line stands out from the lines beside it; that of its band is free."""
@@ -386,6 +387,7 @@ def test_anomalous_samples_do_not_raise_the_noise(size):
     assert error < 0.05 * value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 @pytest.mark.parametrize(
     ("table", "grid"),

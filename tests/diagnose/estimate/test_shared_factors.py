@@ -60,6 +60,7 @@ def estimate_sizes(noise_only, factors, number, *, bandwidth=math.inf, axes=AXES
     return estimate_shared_factors(components, axes, state)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bandwidth", [math.inf, 1.2])
 def test_intervals_hold_the_true_factors(noise_only, bandwidth):
     truth = (0.0014, 0.0011, -0.0016)

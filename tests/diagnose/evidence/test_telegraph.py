@@ -364,6 +364,7 @@ def test_search_withdraws_jumps_that_are_switches() -> None:
     assert not identifications.unknown
 
 
+@pytest.mark.slow
 def test_search_names_a_switching_channel_before_a_telegraph() -> None:
     """Two levels have more evidence than a noisy supply, but the supply is the cause."""
     identifications = switched([45, 14, 3, 12, 3, 10, 3, 5], 1, step=0.6, scatter=0.3)

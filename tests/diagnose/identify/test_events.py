@@ -135,6 +135,7 @@ def test_return_to_the_old_level_is_not_a_jump(back: float, jump: bool) -> None:
     assert bool(keep_physical(components, state)[0]) == jump
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("back", "jump"), [(1.0, False), (0.0, True)])
 def test_long_weak_event_is_not_a_jump(back: float, jump: bool) -> None:
     """Two errors of a mean, for a twelfth of two hours: too little for noisier means."""
@@ -286,6 +287,7 @@ def test_scores_at_orders_scatter_like_null_records() -> None:
     assert float(real["z"].max()) < 2.0 * float(largest.max())
 
 
+@pytest.mark.slow
 def test_line_of_another_axis_is_named_beside_resets_of_the_ramp():
     """The resets explain lines near multiples of the ramp frequency on their own axis only."""
     phase = np.mod(0.72 * SECOND, 1.0)

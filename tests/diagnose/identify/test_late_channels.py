@@ -73,6 +73,7 @@ def examined(log: xr.Dataset) -> tuple[Examination, Identifications, xr.Dataset,
     return examination, identify_effects(examination), baseline, log
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("delay", "own_stamps"), [(DELAY, False), (-123.0, True)])
 def test_late_or_early_channel_is_found(delay: float, own_stamps: bool) -> None:
     record = examined(recorded([RECTIFIED], delay, own_stamps=own_stamps))
@@ -83,6 +84,7 @@ def test_late_or_early_channel_is_found(delay: float, own_stamps: bool) -> None:
     assert find_late_channel(*record, moved=["vibration"]) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effects", "delay", "world"),
     [

@@ -99,6 +99,7 @@ def _log_whole_rotation(seed: int, *, error: float, size: int = 15_000) -> xr.Da
     return log.assign(rotation_rate=("time", encoder, {"units": "degree s-1"}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first_of(1, 2, 3))
 @pytest.mark.parametrize("error", [0.0, 2e-4])
 def test_whole_rotation_is_no_scale_factor_error(seed: int, error: float):
@@ -148,6 +149,7 @@ def test_tails_of_blocks_in_which_an_axis_turns_do_not_count():
     assert evidence[1] < 3.0
 
 
+@pytest.mark.slow
 def test_axis_that_turns_without_a_channel_leaks_into_another():
     """What nothing explains on the axis that turns does not hide the misalignment of another."""
     log = simulate(

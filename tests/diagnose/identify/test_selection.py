@@ -57,6 +57,7 @@ def test_noise_has_no_identification():
     assert identifications.null_best.size == 40
 
 
+@pytest.mark.slow
 def test_null_records_may_come_in_parts():
     blocks = record([], axes="x", environment=())
     baseline, records = nulls(blocks, 12)
@@ -69,6 +70,7 @@ def test_null_records_may_come_in_parts():
     assert_allclose(best_in_parts, best, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_evidence_does_not_depend_on_the_parts_of_a_group(shaken, monkeypatch):
     state = shaken.state
     candidates = [item for item in shaken.candidates if item.statistic.null_variable]

@@ -108,6 +108,7 @@ def test_a_drift_takes_only_what_it_explains_on_its_axis(jump_nats, on_x, remain
         assert {component.row for component in identification.components} == {identification.axes}
 
 
+@pytest.mark.slow
 def test_both_of_a_pair_are_selected_at_once():
     """Neither explains more than a course of levels while the other is not in the model."""
     second = np.arange(BLOCKS * 20)

@@ -34,7 +34,10 @@ def shaken_record(kind: str, *, seed: int = 5) -> xr.Dataset:
     return reduce_log(log, block="20s")
 
 
-@pytest.mark.parametrize(("kind", "is_separated"), [("rising", True), ("hump", False)])
+@pytest.mark.parametrize(
+    ("kind", "is_separated"),
+    [pytest.param("rising", True, marks=pytest.mark.slow), ("hump", False)],
+)
 def test_vibration_noise_is_alone_only_if_its_spectrum_fits(kind: str, is_separated: bool) -> None:
     blocks = shaken_record(kind)
     baseline, records = nulls(blocks, 30)

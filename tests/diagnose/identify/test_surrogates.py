@@ -72,6 +72,7 @@ def test_unrelated_channel_fails():
     assert p_value > 0.05
 
 
+@pytest.mark.slow
 def test_an_unrelated_channel_is_no_better_than_its_surrogates(monkeypatch):
     """An unrelated channel explains as much as half of its surrogates, whatever time constants are
     tried."""
@@ -222,6 +223,7 @@ def test_p_values_of_unrelated_channels_hold_their_level(
         assert np.mean(p_values <= level) <= allowed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "statistic", "kind"),
     [

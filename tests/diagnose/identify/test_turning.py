@@ -36,6 +36,7 @@ def _some_parameters(effect, *names):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("around", first_of(-90.0, 90.0))
 def test_earth_rate_is_recovered(around):
     log = _simulate_rotation(
@@ -67,6 +68,7 @@ def test_earth_rate_is_recovered(around):
     assert float(np.abs(simulated["rate"] - log["rate"]).max()) < 0.01 * float(log["rate"].std())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("latitude", "most"), [(60.0, 4.5), (89.8, 0.3)])
 def test_angles_have_the_relative_error_of_the_size(latitude, most):
     """4 % of the earth rate across the tool, not of the angle, whose origin is arbitrary."""

@@ -306,6 +306,7 @@ def _add_spikes(rate, t, rng):
     rate[0, at] += rng.choice([-1.0, 1.0], 12) * 15.0 * SIGMA
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect", "statistic", "axes", "begin", "end"),
     [

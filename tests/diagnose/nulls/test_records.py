@@ -69,6 +69,7 @@ def close(expected: xr.DataArray, drawn: xr.DataArray, *, rel: float) -> None:
     assert float(expected.std()) == pytest.approx(scale, rel=rel)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [pytest.param(0.0, marks=pytest.mark.full), 0.3])
 def test_statistics_match_those_of_raw_logs(lost):
     raw_records, nulls = both(lost)
@@ -143,6 +144,7 @@ def test_covariance_of_the_lowest_bands_is_that_of_the_taper():
     assert np.corrcoef(left)[0, 3] == pytest.approx(share, abs=4.0 / np.sqrt(left.shape[1]))
 
 
+@pytest.mark.slow
 def test_tails_of_the_kurtosis_match_samples():
     record = reduce_log(
         simulate({"noise": {"N": 0.003}}, duration="1h", rate=10.0, seed=1).compute()

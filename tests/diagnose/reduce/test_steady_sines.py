@@ -40,6 +40,7 @@ def test_bayes_factor_of_noise_has_mean_one(count):
     assert mean == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["white", "lost", "walk", "quantized", "burst"])
 def test_noise_has_no_sine(case):
     rng = np.random.default_rng([1, len(case)])
@@ -101,6 +102,7 @@ def test_finds_a_line_whose_phase_wanders():
     assert sines["sine_resolution"][place] > 2.0 * RATE / SIZE  # seen in the parts of the record
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", ["none", "scattered", "stretches"])
 def test_amplitude_has_the_error_it_states(lost):
     rng = np.random.default_rng(4)
@@ -144,6 +146,7 @@ def test_short_records_and_silent_axes_have_no_search():
     assert np.isfinite(sines[0]).any()
 
 
+@pytest.mark.slow
 def test_weak_sine_is_named_with_frequency_and_amplitude():
     rng = np.random.default_rng(7)
     amplitude = np.sqrt(4.0 * 60.0 / SIZE)

@@ -65,6 +65,7 @@ def shaken():
     return changed, baseline, identifications, null_scores(baseline, chance)
 
 
+@pytest.mark.slow
 def test_leaving_out_an_effect_keeps_the_sizes_of_the_others(shaken):
     blocks, baseline, identifications, _ = shaken
     loud, bias, _ = identifications.identified
@@ -305,6 +306,7 @@ def test_leaving_out_power_that_was_fitted_below_zero_adds_none(shaken):
     np.testing.assert_allclose(without[:20] / without[20:40], 1.0, atol=0.2)
 
 
+@pytest.mark.slow
 def test_mean_after_a_restart_is_explained_by_an_effect_before_it() -> None:
     """The power fails between two blocks, five blocks after a burst of vibration."""
     quiet = record([])

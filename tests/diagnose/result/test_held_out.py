@@ -187,6 +187,7 @@ def test_noise_is_calibrated_without_held_out_blocks(monkeypatch):
         np.testing.assert_allclose(of_louder[:, known], of_blocks[:, known], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_effect_fitted_to_noise_loses():
     """An effect whose size is fitted to the rest of the record gains nothing on held-out data
     without it."""

@@ -259,6 +259,7 @@ def test_limit_of_a_mixture_lies_between_its_laws(laws):
     assert ends.min() * (1.0 - 1e-9) <= limit <= ends.max() * (1.0 + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("points", "has_forecast"),
     [
@@ -290,6 +291,7 @@ def test_only_lasting_effects_are_forecast(points: list[list[float]], has_foreca
         assert held["forecast_gain"] > 0.0
 
 
+@pytest.mark.slow
 def test_noise_that_is_over_does_not_spoil_the_forecast_of_another_effect():
     """The forecast begins from noise that was calibrated with the vibration in its model."""
     shaken = {

@@ -40,6 +40,7 @@ def shaken_blocks(seed: int, *, band_hz: tuple[float, float] | None) -> xr.Datas
     return reduce_log(log, block="20s")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first_of(1, 2, 3))
 @pytest.mark.parametrize("band_hz", [None, (600.0, 725.0)])
 def test_only_known_frequencies_of_aliased_vibration_are_stated(
@@ -137,6 +138,7 @@ def test_coarse_grid_of_angles_is_stated_beside_what_is_not_explained() -> None:
     assert "angle counter" in str(Diagnosis(made, surfaces(), model()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", first_of(1, 2))
 def test_coarse_angle_counter_is_recognised(seed: int) -> None:
     """Two values of the log: the counter advances by a step in some samples only."""

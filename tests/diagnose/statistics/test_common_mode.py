@@ -79,6 +79,7 @@ def test_independent_axes_have_normal_scores(assumed, true, missing):
     assert 0.7 < few.std() < 1.2  # smaller if independent increments are taken as correlated
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shares", [(1.0, 0.8, -0.9), (-0.5, 1.0, 0.7)])
 def test_a_common_waveform_is_found_that_no_axis_shows_alone(base, null, shares):
     blocks = _with_waveform(_quiet_records(30, 5), shares)

@@ -42,6 +42,7 @@ def try_jumps(blocks: xr.Dataset, baseline: xr.Dataset) -> tuple[Candidate, Stat
     return jumps, initial_state(blocks, baseline)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("way", "size", "jump"),
     [
@@ -67,6 +68,7 @@ def test_gradual_change_is_not_a_jump(way: float, size: float, jump: bool) -> No
     assert bool(keep_physical(components, state)[0]) == jump
 
 
+@pytest.mark.slow
 def test_an_instant_that_axes_share_is_searched_once() -> None:
     """A jump that is weak on each of six axes is no scatter of their means."""
     axes = list("uvwxyz")

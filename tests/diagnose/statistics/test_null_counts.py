@@ -39,6 +39,7 @@ def log_of(values: NDArray[np.float64]) -> xr.Dataset:
     return make_log(values[None], rate=50.0, unit="deg/h", start="2026-01-01")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [0.05, pytest.param(0.2, marks=pytest.mark.full), 0.5, 1.0])
 @pytest.mark.parametrize("kind", ["white", "low-passed", "angle", "two levels"])
 def test_null_records_have_the_counts_of_the_grid(kind: str, step: float):

@@ -175,6 +175,7 @@ def test_detection_limit_of_a_mean_step(base, null):
     assert below < 0.5 < above
 
 
+@pytest.mark.slow
 def test_detection_limit_of_shared_noise(base, null):
     def shared(blocks, rho):
         power, pairs = blocks["power"].values, ((0, 1), (0, 2), (1, 2))

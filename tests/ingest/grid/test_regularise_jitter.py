@@ -80,6 +80,7 @@ def test_a_rate_that_is_not_round_a_clock_that_drifts_and_a_gap():
     assert log.attrs["sampling_rate_hz"] == pytest.approx(99.7 / (1 + 30e-6), rel=3e-6)
 
 
+@pytest.mark.slow
 def test_jitter_at_random_in_every_way():
     combinations = list(itertools.product(JITTER, LOSSES))
 
@@ -199,6 +200,7 @@ def test_stamps_of_a_broken_frame_make_no_gap_longer_than_allowed():
     assert log.sizes["time"] < 36_000
 
 
+@pytest.mark.slow
 def test_every_restart_of_a_clock_within_the_second_is_found():
     random = np.random.default_rng(0)
     stamps = (np.arange(3000) / 30 * 1000 + 10 * random.standard_normal(3000)).astype(int) % 1000

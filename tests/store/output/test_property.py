@@ -153,6 +153,7 @@ def check_tree(
         assert new == old
 
 
+@pytest.mark.slow
 @settings(
     max_examples=25,
     deadline=None,

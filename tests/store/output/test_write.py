@@ -46,6 +46,7 @@ for log in (whole, whole.chunk(time=50_000)):
 """
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_the_old_file_and_one_message(tmp_path):
     """Logs in memory and lazy ones."""
     (tmp_path / "out.nc").write_text("old")
