@@ -25,11 +25,7 @@ from gyrostab.diagnose.identify.identification import (
 )
 from gyrostab.diagnose.identify.naming_order import find_pair, order_passing, order_rivals
 from gyrostab.diagnose.identify.settling import find_rejections, prune_selections, settle_selections
-from gyrostab.diagnose.identify.withdrawal import (
-    drop_explained_jumps,
-    withdraw_effects,
-    without_pulses,
-)
+from gyrostab.diagnose.identify.withdrawal import withdraw_effects, without_pulses
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
@@ -52,14 +48,12 @@ def identify_effects(examination: Examination) -> Identifications:
     """
     examination = identify_expected_effects(examination)
     selected, beaten = _select_all(examination)
-    chosen = without_pulses(drop_explained_jumps(selected, examination), examination.settings)
+    chosen = without_pulses(selected, examination.settings)
     chosen, identified = settle_selections(examination, prune_selections(examination, chosen))
     unidentified = [selection for selection in chosen if not selection.is_named]
-    state = examination.state_with([*identified, *unidentified])
-    remaining, withdrawn = withdraw_effects(examination, state, identified, unidentified)
+    remaining, withdrawn = withdraw_effects(examination, identified, unidentified)
     unidentified += withdrawn
-    if withdrawn or remaining != identified:
-        state = examination.state_with([*remaining, *unidentified])
+    state = examination.state_with([*remaining, *unidentified])
     remaining = sorted(remaining, key=lambda identification: -identification.evidence_nats)
     all_evidence = score_candidates(examination, state, ())
     components = merge_lines(group_components(all_evidence, settings=examination.settings))

@@ -209,11 +209,9 @@ def find_rejections(
     settled: list[Selection] = [*identified, *unidentified]
     chosen: list[Selection] = [*identified]
     for selection in unidentified:
-        if selection.components:
-            without = examination.state_with(settled, without=selection)
-            instead_of_it, _ = _find_instead(examination, selection, without)
-            selection = replace(selection, instead=_sum_by_key(instead_of_it))
-        chosen.append(selection)
+        without = examination.state_with(settled, without=selection)
+        instead_of_it, _ = _find_instead(examination, selection, without)
+        chosen.append(replace(selection, instead=_sum_by_key(instead_of_it)))
     named = {
         selection.effect for selection in (*examination.expected, *chosen) if selection.is_named
     }

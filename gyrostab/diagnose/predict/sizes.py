@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.held_out import Tier, mean_residual, noise_weight
+from gyrostab.diagnose.evidence.held_out import mean_residual, noise_weight
 from gyrostab.diagnose.evidence.mixture import Mixture, products_mixture
 from gyrostab.diagnose.evidence.products import axis_noise, mean_products
 from gyrostab.diagnose.predict.candidates import Component, Variant
@@ -24,14 +24,12 @@ def mean_mixture(
     axis: str,
     columns: Sequence[Array],
     *,
-    tier: Tier = "free",
     variance: Array | None = None,
 ) -> Mixture:
     """Compute the sizes of columns of the block means of an axis, over the grid of K and B.
 
-    The columns (block,) of named effects are free; `tier` is the freedom of the noise, as in
-    `gyrostab.diagnose.evidence.held_out.mean_factors`. The white variance of the means (block,)
-    [degree2 hour-2] is that of the baseline unless it is given.
+    The columns (block,) of named effects are free, as is the noise within its grid. The white
+    variance of the means (block,) [degree2 hour-2] is that of the baseline unless it is given.
     """
     baseline = state.baseline
     y = mean_residual(state.blocks, baseline, axis)[:, 0]
@@ -50,7 +48,7 @@ def mean_mixture(
         step=float(state.blocks.attrs["block_s"]),
         present=present,
     )
-    mixture = products_mixture(products, noise_weight(baseline, axis, tier), ridge=_RIDGE)
+    mixture = products_mixture(products, noise_weight(baseline, axis, "free"), ridge=_RIDGE)
     own_count = len(columns)
     scale = size[:own_count]
     return Mixture(

@@ -1,7 +1,6 @@
 """A bias that switches between two levels in the block means: evidence, look-alikes, diagnosis."""
 
 from collections.abc import Sequence
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,11 +11,9 @@ from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.evidence.telegraph import telegraph_courses, telegraph_evidence
 from gyrostab.diagnose.identify.identifiability import keep_physical
-from gyrostab.diagnose.identify.identification import Identifications, Selection
+from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.identify.naming_order import put_followers_first
-from gyrostab.diagnose.identify.withdrawal import drop_explained_jumps
-from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component, Variant
-from gyrostab.diagnose.predict.condition import condition_on_components
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import DEFAULTS
@@ -266,78 +263,6 @@ def test_an_effect_of_a_switching_channel_comes_first(
     ]
 
 
-REAL, HOP = 41, -1  # blocks: a jump of another size than the switches; and the last switch
-
-
-@pytest.mark.parametrize(
-    ("size", "places", "remaining"),
-    [(0.0, (0, HOP), ()), (3.0, (REAL,), (REAL,)), (3.0, (REAL, HOP), (REAL,))],
-    ids=["none", "one", "one of two"],
-)
-def test_switches_are_not_also_jumps(
-    size: float, places: tuple[int, ...], remaining: tuple[int, ...]
-) -> None:
-    """First and last switch were named as jumps; a jump four times as large is a jump."""
-    rng = np.random.default_rng(12)
-    course = telegraph_share(rng, 150.0, 200.0)
-    moves = np.flatnonzero(np.abs(np.diff(course)) > 0.5) + 1
-    start = state_of(0.7 * course + size * (np.arange(BLOCKS) >= REAL) + white(rng, 1)[0])
-    candidate = component(start, course).candidate
-
-    def gains(_: object, state: State) -> list[CandidateEvidence]:
-        columns = state.given.get(("mean", "x"), [])
-        evidence_nats, telegraph = telegraph_evidence(
-            state.blocks,
-            state.baseline,
-            axis="x",
-            given=np.stack(columns, axis=-1) if columns else None,
-        )
-        return [
-            CandidateEvidence(
-                candidate,
-                [("x",)],
-                evidence_nats[:, None],
-                (Variant({}, ("step",), telegraph.share[0][None, None]),),
-            )
-        ]
-
-    def state_with(identifications: Sequence[Selection]) -> State:
-        return condition_on_components(
-            start,
-            [
-                component
-                for identification in identifications
-                for component in identification.components
-            ],
-        )
-
-    jumps = [jump(place if place == REAL else int(moves[place]), 20.0) for place in places]
-    first = Selection("bias_jump", (), ("x",), tuple(jumps), 20.0 * len(jumps), 8.0)
-    (evidence,) = gains((), state_with([first]))
-    evidence_nats = float(evidence.evidence_nats[0, 0])
-    hopping = Selection(
-        "telegraph",
-        (),
-        ("x",),
-        (Component(candidate, evidence.best[0], ("x",), evidence_nats),),
-        evidence_nats,
-        8.0,
-    )
-    examination = SimpleNamespace(
-        start=start, threshold=8.0, state_with=state_with, compute_evidence=gains
-    )
-    left = drop_explained_jumps([first, hopping], examination)
-    assert [identification.effect for identification in left] == ["bias_jump"] * bool(remaining) + [
-        "telegraph"
-    ]
-    assert [
-        component.variant.values["at"]
-        for component in left[0].components
-        if component.candidate.effect == "bias_jump"
-    ] == [place * STEP for place in remaining]
-    assert np.abs(np.corrcoef(left[-1].components[0].variant.design[0, 0], course)[0, 1]) > 0.98
-
-
 def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) -> Identifications:
     """Diagnose a telegraph with these mean times [blocks] and a supply that switches like it."""
     course = np.repeat(np.arange(len(stays)) % 2, stays).astype(float)
@@ -354,14 +279,6 @@ def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) ->
     )
     blocks = reduce_log(log, block="20s")
     return name_effects(blocks, *nulls(blocks, 40))
-
-
-@pytest.mark.slow
-def test_search_withdraws_jumps_that_are_switches() -> None:
-    """A noisy supply delays the switches; their last jump is named first, then withdrawn."""
-    identifications = switched([0, 8, 1, 21, 1, 33, 21], 9, step=0.6, scatter=0.45)
-    assert [identification.effect for identification in identifications.identified] == ["telegraph"]
-    assert not identifications.unknown
 
 
 @pytest.mark.slow

@@ -75,8 +75,7 @@ def test_an_effect_stays_beside_an_unidentified_burst():
     others = [selection for selection in chosen if not selection.is_named]
     assert [selection.effect for selection in named] == ["vibration_noise"]
     assert [selection.effect for selection in others] == ["~burst"]
-    state = examination.state_with([*named, *others])
-    assert withdraw_effects(examination, state, named, others) == (named, [])
+    assert withdraw_effects(examination, named, others) == (named, [])
 
 
 def _explain(effect, statistic, evidence):

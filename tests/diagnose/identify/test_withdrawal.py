@@ -9,12 +9,11 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.examination import Examination, nuisance_alternatives
 from gyrostab.diagnose.identify.selection import _select_all
-from gyrostab.diagnose.identify.withdrawal import excess_low_frequency_noise, variance_fluctuation
+from gyrostab.diagnose.identify.withdrawal import variance_fluctuation
 from gyrostab.diagnose.predict.condition import refit_weights
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -75,20 +74,6 @@ def test_masked_blocks_do_not_count() -> None:
     state = initial_state(blocks, calibrate_noise(blocks))
     assert variance_fluctuation(state, "x") > 8.0
     assert variance_fluctuation(replace(state, masked=(burst > 1.0)[None]), "x") < 2.0
-
-
-@pytest.mark.parametrize(
-    ("excess", "is_found"), [(0.2, False), (9.0, True), (38.0, True), (76.0, True)]
-)
-def test_slow_noise_beyond_any_that_is_tried_is_found(excess: float, is_found: bool) -> None:
-    """The grid of random walks ends at 30 times the model's."""
-    rng = np.random.default_rng(1)
-    rate = 0.6 * rng.standard_normal((1, 18_000))
-    rate += excess * 0.02 / np.sqrt(36_000.0) * rng.standard_normal(rate.shape).cumsum(axis=1)
-    blocks = reduce_log(make_log(rate, rate=10.0, unit="deg/h"))
-    model = {"noise": {"N": 0.003, "B": 0.004, "K": 0.02}, "log": {"axes": ["x"]}}
-    state = initial_state(blocks, baseline_from_model(blocks, model))
-    assert (excess_low_frequency_noise(state, "x") > 10.0) == is_found
 
 
 @pytest.mark.slow
