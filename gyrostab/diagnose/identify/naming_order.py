@@ -283,6 +283,7 @@ def find_pair(
     other one; nothing without such a pair.
     """
     alternative = components[passing[0]]
+    is_in_means = alternative[0].statistic.view == "mean"
     is_course = alternative[0].statistic.is_switching  # of levels, as jumps make it
     keys = [
         key
@@ -290,7 +291,7 @@ def find_pair(
         if not key.startswith("~")
         and (
             components[key][0].statistic is alternative[0].statistic
-            or (is_course and components[key][0].statistic.is_linear_in_means)
+            or (is_in_means and components[key][0].statistic.is_linear_in_means)
         )
     ]
     companions = {

@@ -26,7 +26,7 @@ from gyrostab.diagnose.settings import Settings
 Array = NDArray[np.float64]
 
 #: Arbitrary courses of the bias.
-_DRIFTS = ("~bias(t)", "~levels")
+_DRIFTS = ("~bias(t)", "~levels", "~red")
 #: Flicker and random walk that are tried, as multiples of the least that the record can show.
 _NOISE_STEPS = (1.0, 3.0, 10.0, 30.0)
 

@@ -11,9 +11,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.diagnose.baseline.axis_means import MAX_SCATTER
 from gyrostab.diagnose.baseline.posterior import visible_coefficients
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.evidence.held_out import Tier, mean_factors
+from gyrostab.diagnose.evidence.held_out import Tier, mean_factors, mean_residual
 from gyrostab.diagnose.evidence.wandering import expected_processes, with_process
 from gyrostab.diagnose.predict.average_sizes import plain_places
 from gyrostab.diagnose.predict.candidates import (
@@ -31,17 +32,18 @@ from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, mean_inputs
 from gyrostab.units import HOUR
 
 Array = NDArray[Any]
-#: Sizes of a walk that are tried, as multiples of the walk that the means just show; and those
-#: that its size is estimated from. Design choice: half decades, and steps of 12 %.
-_WALK_FACTORS = 10.0 ** np.arange(0.0, 3.1, 0.5)
-_FINE_FACTORS = 10.0 ** np.arange(-0.5, 3.1, 0.05)
+#: Sizes of a walk that are tried, and those that its size is estimated from: decades above the walk
+#: that the means just show, of the first, and between two. Design choice: half decades, and 12 %.
+_WALK_DECADES = (0.0, 0.5)
+_FINE_DECADES = (-0.5, 0.05)
+_LAST_DECADE = 3.0  # of sizes, at least
 
 
 class RandomProcess(BlockMeanStatistic):
-    """A random walk in the block means that is present only while its channel is active.
+    """A random walk in the block means, present only while its channel is active or far too strong.
 
     No null record or score is its own. The flicker and random walk of the noise are free in its
-    evidence, so that a steady walk could not be distinguished from them.
+    evidence, within their grid, so that a steady walk shows only beyond the grid.
     """
 
     name = "random_process"
@@ -60,6 +62,11 @@ class RandomProcess(BlockMeanStatistic):
             if np.isinf(time) and np.ptp(variance) > 0.0:
                 yield Variant(case.values, (name,), np.asarray(variance)[None], squared=True)
 
+    def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
+        """Return a steady random walk beyond that of the calibration."""
+        steady = Variant({}, ("walk",), np.ones((1, blocks.sizes["block"])), squared=True)
+        return [Candidate("~red", self, (), (steady,))]
+
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
         """Compute the Bayes factor of random walks that follow a channel, of any size.
 
@@ -73,10 +80,13 @@ class RandomProcess(BlockMeanStatistic):
                 compute = partial(_factors_by_variant, candidate, axis, trial)
                 of_sizes = trial.recall(compute, [candidate], *mean_inputs(trial, axis))
                 # (variant, record)
-                factors = np.stack([np.logaddexp.reduce(by_size, axis=0) for by_size in of_sizes])
-                factors = (
-                    factors - np.log(_WALK_FACTORS.size) + np.log(prior / prior.sum())[:, None]
+                factors = np.stack(
+                    [
+                        np.logaddexp.reduce(by_size, axis=0) - np.log(len(by_size))
+                        for by_size in of_sizes
+                    ]
                 )
+                factors = factors + np.log(prior / prior.sum())[:, None]
                 evidence_nats.append(np.logaddexp.reduce(factors, axis=0))
                 best.append(_plain_or_best(candidate, factors[:, 0], trial.state.settings))
             rows = self.rows(candidate, trial.state)
@@ -108,6 +118,8 @@ class RandomProcess(BlockMeanStatistic):
 def _plain_or_best(candidate: Candidate, evidence_nats: Array, settings: Settings) -> Variant:
     """Return the variant with the default exponent, unless another explains clearly more."""
     best = int(evidence_nats.argmax())
+    if len(candidate.variants) == 1:
+        return candidate.variants[0]
     plain = [
         place
         for place in plain_places(candidate.effect, candidate.variants)
@@ -119,7 +131,7 @@ def _plain_or_best(candidate: Candidate, evidence_nats: Array, settings: Setting
 def _factors_by_variant(candidate: Candidate, axis: str, trial: Trial) -> list[Array]:
     """Return the factors of each variant, (size, record)."""
     return [
-        _walk_factors(variant, axis, trial.data, trial.state, _WALK_FACTORS)[1]
+        _walk_factors(variant, axis, trial.data, trial.state, _WALK_DECADES)[1]
         for variant in candidate.variants
     ]
 
@@ -129,20 +141,26 @@ def _walk_factors(
     axis: str,
     data: xr.Dataset,
     state: State,
-    steps: Array,
+    decades: tuple[float, float],
     *,
     tier: Tier = "free",
 ) -> tuple[Array, Array]:
     """Return sizes of a walk (size,), and the log Bayes factors of each (size, record).
 
-    Where the channel is most active, the walk is `steps` times that which the means just show.
+    They are those where the channel is most active, up to one as large as the scatter of the means.
+    `decades` are those of the first above a walk that the means just show, and between two.
     """
     baseline, folds = state.baseline, fold_blocks(data).isel(length=slice(0, 0))
     processes = expected_processes(baseline, axis)
     block, count = float(data.attrs["block_s"]), data.sizes["block"]
     density = block * float(np.nanmedian(baseline["mean_variance"].sel(axis=axis)))
     visible, _ = visible_coefficients(density, block * count)
-    sizes = visible * steps / np.sqrt(HOUR * variant.design.max())
+    means = mean_residual(state.blocks, baseline, axis)[:, 0]
+    scatter = np.diff(means[np.isfinite(means)]).std() * np.sqrt(HOUR / block)
+    first, step = decades
+    last = max(_LAST_DECADE, np.log10(max(MAX_SCATTER * scatter / visible, 1.0)))
+    sizes = visible * 10.0 ** np.arange(first, last + step, step)
+    sizes /= np.sqrt(HOUR * variant.design.max())
 
     def log_evidence(walk: Array) -> Array:
         factors = mean_factors(
@@ -164,7 +182,7 @@ def _walk_factors(
 def _walk_size(component: Component, state: State, variant: Variant) -> tuple[float, float]:
     """Return the size of a walk that follows a channel in calibrated noise, and its error."""
     sizes, factors = _walk_factors(
-        variant, component.row[0], state.blocks, state, _FINE_FACTORS, tier="calibrated"
+        variant, component.row[0], state.blocks, state, _FINE_DECADES, tier="calibrated"
     )
     weight = np.exp(factors[:, 0] - np.logaddexp.reduce(factors[:, 0]))
     mean = float(weight @ sizes)

@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.correlated_bias import (
@@ -61,6 +62,9 @@ class WanderingBias(RandomProcess):
                 yield Variant(
                     case.values, (name,), np.asarray(variance)[None], squared=True, time=time
                 )
+
+    def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
+        return []
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
         """Compute the Bayes factor of a bias of any rms and correlation time.
