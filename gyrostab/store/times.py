@@ -70,7 +70,6 @@ def find_time_grids(dataset: xr.Dataset) -> dict[Any, Any]:
 def encode_first_stamp(grid: Any, attrs: dict[Any, Any], divisor: int) -> xr.Variable:
     """Encode a computed time axis: its first stamp, with rate and exact rule as attributes."""
     (dim,) = grid.dims
-    first = int(grid_times(grid.start, grid.rate, grid.samples.start))
     attributes = {
         "long_name": f"time of the first sample on the dimension {index_dim(dim)}",
         "comment": "sample n (from 0) is at this time + n / sampling_rate_hz; "
@@ -80,7 +79,7 @@ def encode_first_stamp(grid: Any, attrs: dict[Any, Any], divisor: int) -> xr.Var
     }
     return xr.Variable(
         (),
-        np.int64(first // divisor),
+        grid.stamps_at(0) // divisor,
         {**attributes, **_encode_rule(grid, attrs), **time_attributes(divisor)},
     )
 
@@ -120,9 +119,8 @@ class _GridStamps(RowSource):
         self.shape, self.dtype = (grid.size,), np.dtype(np.int64)
 
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
-        grid = self.grid
-        samples = grid.samples.start + grid.samples.step * np.arange(begin, begin + out.size)
-        np.floor_divide(grid_times(grid.start, grid.rate, samples), self.divisor, out=out)
+        stamps = self.grid.stamps_at(np.arange(begin, begin + out.size))
+        np.floor_divide(stamps, self.divisor, out=out)
 
 
 def has_whole_microseconds(
@@ -133,7 +131,7 @@ def has_whole_microseconds(
         if name in grids:
             grid = grids[name]
             nanoseconds, fraction = period_ns(grid.rate)
-            if int(grid_times(grid.start, grid.rate, grid.samples.start)) % 1000 or (
+            if grid.stamps_at(0) % 1000 or (
                 stamps and (fraction or nanoseconds * grid.samples.step % 1000)
             ):
                 return False

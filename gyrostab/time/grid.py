@@ -137,16 +137,22 @@ class _GridTransform(CoordinateTransform):
     def size(self) -> int:
         return len(self.samples)
 
+    def stamps_at(self, positions: Any) -> NDArray[np.int64]:
+        """Return the stamps [ns since 1970] of places among the samples."""
+        samples = self.samples.start + self.samples.step * np.asarray(positions, dtype=np.int64)
+        return grid_times(self.start, self.rate, samples)
+
+    def find_positions(self, stamps: Any) -> NDArray[np.float64]:
+        """Return the places of stamps among the samples, in fractions."""
+        sample = grid_index(self.start, self.rate, to_nanoseconds(stamps))
+        return np.asarray((sample - self.samples.start) / self.samples.step)
+
     def forward(self, dim_positions: dict[str, Any]) -> dict[Any, Any]:
-        position = np.asarray(dim_positions[self.dims[0]], dtype=np.int64)
-        sample = self.samples.start + self.samples.step * position
-        stamps = grid_times(self.start, self.rate, sample)
+        stamps = self.stamps_at(dim_positions[self.dims[0]])
         return {self.coord_names[0]: stamps.view("datetime64[ns]")}
 
     def reverse(self, coord_labels: dict[Any, Any]) -> dict[str, Any]:
-        stamps = to_nanoseconds(coord_labels[self.coord_names[0]])
-        sample = grid_index(self.start, self.rate, stamps)
-        return {self.dims[0]: (sample - self.samples.start) / self.samples.step}
+        return {self.dims[0]: self.find_positions(coord_labels[self.coord_names[0]])}
 
     def equals(self, other: CoordinateTransform, *, exclude: frozenset[Any] | None = None) -> bool:
         return isinstance(other, _GridTransform) and (self.start, self.rate, self.samples) == (
@@ -159,10 +165,9 @@ class _GridTransform(CoordinateTransform):
         """Return other samples of the same grid."""
         return _GridTransform(self.start, self.rate, samples, self.dims[0])
 
-    def end_stamps(self) -> NDArray[Any]:
+    def end_stamps(self) -> NDArray[np.int64]:
         """Return the first and last stamp; two equal ones if there is none in between."""
-        ends = {self.dims[0]: np.array([0, max(self.size - 1, 0)])}
-        return np.asarray(self.forward(ends)[self.coord_names[0]])
+        return self.stamps_at([0, max(self.size - 1, 0)])
 
 
 def _span_of(bound: Any) -> tuple[np.datetime64, np.datetime64]:
@@ -192,9 +197,7 @@ class TimeGridIndex(CoordinateTransformIndex):
     @property
     def start(self) -> int:
         """Stamp of the first sample [ns since 1970]."""
-        return int(
-            grid_times(self.transform.start, self.transform.rate, self.transform.samples.start)
-        )
+        return int(self.transform.stamps_at(0))
 
     @property
     def rate(self) -> float:
@@ -295,10 +298,9 @@ class TimeGridIndex(CoordinateTransformIndex):
             raise ValueError(
                 f"a uniform time axis selects with method='nearest' or exactly, not {method!r}"
             )
-        (name,), (dim,) = self.transform.coord_names, self.transform.dims
-        position = np.rint(self.transform.reverse({name: stamps})[dim])
-        nearest = np.clip(position, 0, max(self.transform.size - 1, 0)).astype(np.int64)
-        miss = np.abs(self.transform.forward({dim: nearest})[name] - stamps)
+        positions = np.rint(self.transform.find_positions(stamps))
+        nearest = np.clip(positions, 0, max(self.transform.size - 1, 0)).astype(np.int64)
+        miss = np.abs(self.transform.stamps_at(nearest).view("datetime64[ns]") - stamps)
         if method is None:
             most: np.timedelta64 = np.timedelta64(0, "ns")
         elif tolerance is not None:
@@ -308,16 +310,15 @@ class TimeGridIndex(CoordinateTransformIndex):
         return nearest, (miss <= most) & (self.transform.size > 0)
 
     def _find_slice(self, label: slice) -> slice:
-        (name,), (dim,) = self.transform.coord_names, self.transform.dims
         size = self.transform.size
 
         def edge(bound: Any, side: str) -> int | None:
             if bound is None:
                 return None
             stamp = _span_of(bound)[0 if side == "left" else 1]
-            guess = int(np.clip(self.transform.reverse({name: stamp})[dim], 1, size + 1)) - 1
+            guess = int(np.clip(self.transform.find_positions(stamp), 1, size + 1)) - 1
             while guess < size:  # at most three steps: only rounding is missing
-                grid_stamp = self.transform.forward({dim: guess})[name]
+                grid_stamp = self.transform.stamps_at(guess).view("datetime64[ns]")
                 if grid_stamp > stamp or (grid_stamp == stamp and side == "left"):
                     break
                 guess += 1
