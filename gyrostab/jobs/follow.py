@@ -16,7 +16,7 @@ import xarray as xr
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import Spool
 from gyrostab.ingest.combine import move_to_disk
-from gyrostab.ingest.concat.lazy import GridSource
+from gyrostab.ingest.concat.lazy import GridSource, clip_runs
 from gyrostab.ingest.files import read_file
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.schema import log_channels, signal_name
@@ -170,14 +170,7 @@ def hash_samples(log: xr.Dataset, span: tuple[int, int], common: str) -> bytes:
         source = find_source(variable.data)
         if isinstance(source, GridSource):
             for _, _, runs in (part for row in source.rows for part in row):
-                first = np.searchsorted(runs[:, 0] + runs[:, 2], begin, side="right")
-                overlapping_runs = runs[first : np.searchsorted(runs[:, 0], end)].copy()
-                if len(overlapping_runs):
-                    ends = overlapping_runs[:, 0] + overlapping_runs[:, 2]
-                    cut = np.maximum(begin - overlapping_runs[:, 0], 0)
-                    overlapping_runs[:, :2] += cut[:, None]
-                    overlapping_runs[:, 2] = np.minimum(ends, end) - overlapping_runs[:, 0]
-                total.update(overlapping_runs.tobytes())
+                total.update(np.array(clip_runs(runs, begin, end), dtype=np.int64).tobytes())
         else:
             total.update(read_slice(variable.data, begin, end).tobytes())
     return total.digest()

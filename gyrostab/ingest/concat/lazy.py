@@ -88,7 +88,7 @@ class GridSource(RowSource):
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
         """Read samples of one row from `begin` on into `out`; the first that is not NaN counts."""
         end, done = begin + out.size, 0
-        parts = [(array, own, _clip_runs(runs, begin, end)) for array, own, runs in self.rows[row]]
+        parts = [(array, own, clip_runs(runs, begin, end)) for array, own, runs in self.rows[row]]
         parts = [part for part in parts if part[2]]
         if len(parts) != 1 or parts[0][2][0][2] < out.size:
             out[:] = np.nan
@@ -141,7 +141,7 @@ def _group_runs(array: Any, runs: Sequence[Run]) -> Iterator[Sequence[Run]]:
         begin = stop
 
 
-def _clip_runs(runs: NDArray[np.int64], begin: int, end: int) -> list[Run]:
+def clip_runs(runs: NDArray[np.int64], begin: int, end: int) -> list[Run]:
     """Return the parts of runs in a range of the grid, by their offset after `begin`."""
     low = np.searchsorted(runs[:, 0] + runs[:, 2], begin, side="right")
     high = np.searchsorted(runs[:, 0], end, side="left")
