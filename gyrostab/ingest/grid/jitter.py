@@ -20,6 +20,7 @@ from gyrostab.ingest.grid.starting_period import (
     Integers,
     Parts,
     Stamps,
+    find_steps,
     readable_stamps,
 )
 from gyrostab.kernels.grid.course import LOSS_NATS, follow
@@ -305,7 +306,7 @@ def count_samples(
 
 def longest_step(parts: Parts, period: float) -> float:
     """Return the step [ns] after which counting restarts when rows are placed by count."""
-    steps = np.concatenate([np.diff(part) for part in parts])
+    steps = find_steps(parts)
     return float(max(SECOND, 50 * period, 10 * np.quantile(np.abs(steps), 0.99)))
 
 

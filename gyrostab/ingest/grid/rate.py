@@ -36,6 +36,7 @@ from gyrostab.ingest.grid.starting_period import (
     Stamps,
     clock_tick,
     comb_peaks,
+    find_steps,
     finer_period,
     losses_accumulate,
     packet_rate,
@@ -113,7 +114,7 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
             f"{where}: there is only one sample with a readable stamp, so no sampling rate can "
             "be found; give it with --rate HZ"
         )
-    steps = np.concatenate([np.diff(part) for part in parts])
+    steps = find_steps(parts)
     backwards = float((steps < 0).mean())
     has_order = (steps > 0).any() and backwards <= _MAX_BACKWARD_SHARE
     estimate = _estimate_ordered(stamps, stretches, parts, sure) if has_order else None
@@ -134,7 +135,7 @@ def estimate_rate(stamps: Stamps, *, where: str) -> RateEstimate:
 
 def _estimate_ordered(stamps: Stamps, stretches: Parts, parts: Parts, sure: float) -> RateEstimate:
     """Find the sampling rate of stamps that mostly rise; a damaged file may give a negative one."""
-    steps = np.concatenate([np.diff(part) for part in parts])
+    steps = find_steps(parts)
     period, counted, coarse = starting_period(stretches)
     finer = None if counted else finer_period(parts, period)
     lost = None if finer is None else _estimate_sharp(stamps, parts, SECOND / finer)
@@ -197,10 +198,7 @@ def _estimate_with_jitter(
 
 
 def _finer_rate(
-    parts: Parts,
-    peaks: list[tuple[float, float]],
-    jitter: JitterModel,
-    sure: float,
+    parts: Parts, peaks: list[tuple[float, float]], jitter: JitterModel, sure: float
 ) -> float | None:
     """Return a higher rate [Hz] that explains the stamps better, with recurring losses."""
     shorter = [period for period, _ in peaks if 1 < jitter.period / period < LONGEST]
@@ -211,9 +209,7 @@ def _finer_rate(
     return float(f"{SECOND / best.period:.4g}")
 
 
-def _sample_stamps(
-    stamps: Stamps,
-) -> tuple[Stamps, Parts, Parts, float]:
+def _sample_stamps(stamps: Stamps) -> tuple[Stamps, Parts, Parts, float]:
     """Return stamps in even blocks, stretches, their readable stamps, and `_trusted_samples`."""
     stamps = partial(recut_blocks, stamps, _BLOCK)
     stretches = sample_stretches(stamps)
@@ -302,7 +298,7 @@ def is_far_worse(stamps: Stamps, given: RateEstimate, estimated: RateEstimate) -
 def _estimate_sharp(stamps: Stamps, parts: Parts, rate: float) -> RateEstimate | None:
     """Estimate the rate near a nominal one [Hz] if steps are whole periods, and some are single."""
     period = SECOND / rate
-    steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
+    steps = find_steps(parts).astype(np.float64)
     single = steps[np.abs(steps / period - 1) < 0.25]
     if (
         len(single) == 0

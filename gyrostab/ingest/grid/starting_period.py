@@ -65,9 +65,7 @@ def recut_blocks(stamps: Stamps, size: int, ahead: int = 0) -> Iterator[Block]:
         yield _concatenate_blocks(held)
 
 
-def _concatenate_blocks(
-    held: list[Block],
-) -> Block:
+def _concatenate_blocks(held: list[Block]) -> Block:
     """Concatenate blocks of rows and stamps; a single non-empty block is not copied."""
     held = [block for block in held if len(block[0])]
     if len(held) == 1:
@@ -80,6 +78,11 @@ def readable_stamps(block: Integers) -> Integers:
     """Return the readable stamps, without a copy if all are readable."""
     is_readable = block != NO_STAMP
     return block if is_readable.all() else block[is_readable]
+
+
+def find_steps(parts: Parts) -> Integers:
+    """Return the steps [ns] between successive stamps of each stretch."""
+    return np.concatenate([np.diff(part) for part in parts])
 
 
 def sample_stretches(stamps: Stamps) -> Parts:
@@ -162,7 +165,7 @@ def packet_rate(stretches: Parts, rate: float) -> float | None:
     >>> packet_rate(packets, 10_000.0), packet_rate(packets, 100.0)
     (100.0, None)
     """
-    steps = np.concatenate([np.diff(readable_stamps(stretch)) for stretch in stretches])
+    steps = find_steps([readable_stamps(stretch) for stretch in stretches])
     rising, period = steps[steps > 0], SECOND / rate
     mean = SECOND / time_per_row(stretches)
     is_packed = (
@@ -199,7 +202,7 @@ def rms_misfit(steps: NDArray[np.float64], period: float) -> float:
     return float(np.sqrt(np.mean((inliers - np.rint(inliers)) ** 2))) if len(inliers) else 0.5
 
 
-def step_scatter(steps: NDArray[np.float64], period: float) -> float:
+def step_scatter(steps: Integers | NDArray[np.float64], period: float) -> float:
     """Return the robust scatter of steps about whole samples [samples]; 0.37 for uniform phases."""
     inliers = steps[np.abs(steps) < 5.5 * period] / period
     return 1.4826 * float(np.median(np.abs(inliers - np.rint(inliers)))) if len(inliers) else 0.5
@@ -236,7 +239,7 @@ def starting_period(stretches: Parts) -> tuple[float, bool, bool]:
     The stretches are those of `sample_stretches`.
     """
     parts = [readable_stamps(stretch) for stretch in stretches]
-    steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
+    steps = find_steps(parts).astype(np.float64)
     rising = steps[steps > 0]
     if _has_shared_stamps(parts, steps):
         return time_per_row(stretches, ticks=True), True, True
@@ -313,7 +316,7 @@ def losses_accumulate(parts: Parts) -> bool:
     It does if samples are lost at random; pauses between packets of rows do not change the number
     of rows in a long time.
     """
-    steps = np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
+    steps = find_steps(parts).astype(np.float64)
     length = min(_SPAN_ROWS, len(steps) // 16)
     if length < _MIN_SPAN_ROWS:
         return False
@@ -327,7 +330,7 @@ def losses_accumulate(parts: Parts) -> bool:
 
 def clock_tick(parts: Parts) -> float:
     """Return the largest time [ns] of which all stamps are multiples, from the first on."""
-    return float(np.gcd.reduce(np.concatenate([np.diff(part) for part in parts])))
+    return float(np.gcd.reduce(find_steps(parts)))
 
 
 def comb_peaks(parts: Parts) -> list[tuple[float, float]]:
@@ -336,7 +339,7 @@ def comb_peaks(parts: Parts) -> list[tuple[float, float]]:
     The power of N stamps at the sampling frequency is 1 + N exp(-4 pi^2 sigma^2) for a jitter of
     sigma samples, whichever samples are missing.
     """
-    steps = np.concatenate([np.diff(part) for part in parts])
+    steps = find_steps(parts)
     steps = steps[steps > 0]
     tick = min(clock_tick(parts), _COMMON_TICK)
     shortest = max(0.7 * float(np.quantile(steps, 0.1)), MIN_TICKS * tick)
