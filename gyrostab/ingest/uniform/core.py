@@ -81,7 +81,7 @@ def as_uniform(log: xr.Dataset) -> xr.Dataset:
     grid, computed = grid_of(log, nominal)
     if not computed:
         if len(grid.runs) > 1:
-            log = place_samples(log, grid.runs, grid.start, grid.rate, grid.size)
+            log = place_samples(log, grid)
         else:
             time = time_coordinate(grid.start, grid.rate, grid.size)
             log = log.drop_vars("time").assign_coords(time)
@@ -191,12 +191,10 @@ def _with_true_table(
     return with_table(log, fitting, grid.start, grid.rate)
 
 
-def place_samples(log: xr.Dataset, runs: Table, start: int, rate: float, size: int) -> xr.Dataset:
+def place_samples(log: xr.Dataset, grid: UniformGrid) -> xr.Dataset:
     """Place the variables along ``time`` of a log on a grid; lazy ones stay lazy.
 
-    `runs` (n, 3) are first sample of the grid, first sample of the log, length; `start` and `rate`
-    those of the grid [ns since 1970, Hz]. Missing samples are NaN. Variables without numbers are
-    left out, with a note.
+    Missing samples are NaN. Variables without numbers are left out, with a note.
     """
     moved = {name: variable for name, variable in log.variables.items() if "time" in variable.dims}
     placed, left_out = {}, []
@@ -210,17 +208,16 @@ def place_samples(log: xr.Dataset, runs: Table, start: int, rate: float, size: i
         in_memory = isinstance(turned.data, np.ndarray)
         array = place_array(
             turned.data,
-            runs,
-            size,
+            grid.runs,
+            grid.size,
             chunk=CHUNK_SAMPLES if in_memory else chunk_of([turned.data]),
             most_in_memory=max(SMALL_SIZE, 2 * variable.size) if in_memory else 0,
         )
         placed[name] = xr.Variable(turned.dims, array, variable.attrs, variable.encoding).transpose(
             *variable.dims
         )
-    placed_log = (
-        log.drop_vars(list(moved)).assign(placed).assign_coords(time_coordinate(start, rate, size))
-    )
+    time = time_coordinate(grid.start, grid.rate, grid.size)
+    placed_log = log.drop_vars(list(moved)).assign(placed).assign_coords(time)
     placed_log = placed_log[[name for name in log.data_vars if name in placed_log.data_vars]]
     placed_log.set_close(close_function(log))
     if left_out:

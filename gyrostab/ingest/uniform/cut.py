@@ -124,11 +124,11 @@ def cut_log(
     kept_spans = kept_spans[kept_spans[:, 1] > kept_spans[:, 0]]
     if not len(kept_spans):
         raise OptionError(f"--exclude leaves nothing of the log; {clock.describe()}")
-    start, size = int(grid_times(grid.start, grid.rate, low)), high - low
-    runs = np.stack(
-        [kept_spans[:, 0] - low, kept_spans[:, 0], kept_spans[:, 1] - kept_spans[:, 0]], axis=1
-    )
-    part = _cut_samples(log, runs, start, grid, low, size)
+    first, end = kept_spans.T
+    runs = np.stack([first - low, first, end - first], axis=1)
+    start = int(grid_times(grid.start, grid.rate, low))
+    kept_grid = UniformGrid(start, grid.rate, high - low, runs)
+    part = _cut_samples(log, kept_grid, low)
     part = _cut_channels(part, grid_times(grid.start, grid.rate, kept_spans.ravel()))
     if "gap" in log.dims or len(excluded):
         part = with_table(part, _cut_table(log, grid, low, kept_spans, excluded), start, grid.rate)
@@ -137,7 +137,7 @@ def cut_log(
         *([f"to {time_to}"] if time_to is not None else []),
         *(f"without {first}/{end}" for first, end in spans),
     ]
-    done = f"gyrostab.cut_log: {', '.join(options)}: {size} samples"
+    done = f"gyrostab.cut_log: {', '.join(options)}: {kept_grid.size} samples"
     return part.assign_attrs(history=extend_history(log, done))
 
 
@@ -221,18 +221,17 @@ class _Clock:
         return max(first, low), min(end, high)
 
 
-def _cut_samples(
-    log: xr.Dataset, runs: NDArray[np.int64], start: int, grid: UniformGrid, low: int, size: int
-) -> xr.Dataset:
+def _cut_samples(log: xr.Dataset, kept_grid: UniformGrid, low: int) -> xr.Dataset:
+    """Return the part of a log on `kept_grid`, which begins at sample `low`; NaN where excluded."""
     lazy = any(
         variable.chunks is not None
         for variable in log.data_vars.values()
         if "time" in variable.dims
     )
-    is_contiguous = len(runs) == 1 and runs[0, 2] == size
-    if is_contiguous and (size == grid.size or not lazy):
-        return log.isel(time=slice(low, low + size))
-    return place_samples(log, runs, start, grid.rate, size)
+    is_contiguous = len(kept_grid.runs) == 1 and kept_grid.runs[0, 2] == kept_grid.size
+    if is_contiguous and (kept_grid.size == log.sizes["time"] or not lazy):
+        return log.isel(time=slice(low, low + kept_grid.size))
+    return place_samples(log, kept_grid)
 
 
 def _cut_channels(part: xr.Dataset, edges: NDArray[np.int64]) -> xr.Dataset:

@@ -27,11 +27,12 @@ _ADVICE = (
 
 
 class UniformGrid(NamedTuple):
-    """Samples at ``start + round(n * 1e9 / rate)`` ns; `runs`: sample, stamp, length."""
+    """Samples at ``start + round(n * 1e9 / rate)``, and those of a log that are placed on them."""
 
-    start: int
-    rate: float
+    start: int  # stamp of sample 0 [ns since 1970]
+    rate: float  # [Hz]
     size: int
+    #: (n, 3): first sample of the grid, first sample of the log, length.
     runs: NDArray[np.int64]
 
 
