@@ -298,7 +298,7 @@ def test_rows_are_put_on_the_grid_directly_as_by_dask(storage, scale, unit, monk
         else stack_rows([concatenate_columns(column, 500) for column in columns])
     )
     placed = rows_on_grid(
-        raw, Placement(0, runs, np.empty((0, 5), np.int64)), chunk=512, scale=scale, unit=unit
+        raw, Placement(0, 1.0, runs, np.empty((0, 5), np.int64)), chunk=512, scale=scale, unit=unit
     )
     assert find_source(placed) is not None
     expected = placed_by_hand(runs, 6100, rows)

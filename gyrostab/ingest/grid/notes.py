@@ -114,12 +114,11 @@ def _count_of(number: int, noun: str) -> str:
 def describe_rate(
     raw: xr.Dataset,
     estimate: RateEstimate,
-    rate: float,
     deviating: list[DeviatingStretch],
     placement: Placement,
 ) -> list[str]:
     """Return notes on the sampling rate."""
-    where = record_name(raw)
+    where, rate = record_name(raw), placement.rate
     notes = []
     reason = (
         "many rows share one stamp"
@@ -211,13 +210,11 @@ def _describe_local(raw: xr.Dataset, jump: float) -> str:
     return describe_clock_change(jump) if raw.attrs.get("local_time") else ""
 
 
-def _describe_missing(
-    raw: xr.Dataset, placement: Placement, table: NDArray[np.int64], rate: float
-) -> list[str]:
+def _describe_missing(raw: xr.Dataset, placement: Placement, table: NDArray[np.int64]) -> list[str]:
     holes = table[(table[:, 4] == MISSING) & (table[:, 2] > 0)]
     if len(holes) == 0:
         return []
-    notes = []
+    notes, rate = [], placement.rate
     longest = holes[np.argsort(-holes[:, 2], kind="stable")]
     longest = longest[longest[:, 2] >= max(2, rate)][:_MAX_NAMED]
     ends = placement.runs[:, 0] + placement.runs[:, 2]
@@ -249,11 +246,11 @@ def _name_row(raw: xr.Dataset, row: int) -> str:
 
 
 def describe_placement(
-    raw: xr.Dataset, scanned: ScanPass, placement: Placement, table: NDArray[np.int64], rate: float
+    raw: xr.Dataset, scanned: ScanPass, placement: Placement, table: NDArray[np.int64]
 ) -> list[str]:
     """Return notes on gaps, restarts, and rows and cells that were dropped or moved."""
     where = record_name(raw)
-    notes = [*_describe_breaks(raw, placement), *_describe_missing(raw, placement, table, rate)]
+    notes = [*_describe_breaks(raw, placement), *_describe_missing(raw, placement, table)]
     events = placement.events
     twice = events[events[:, 0] == DUPLICATE]
     if len(twice):

@@ -51,6 +51,7 @@ class Placement:
     """Rows placed on the samples of a uniform grid."""
 
     start: int  # stamp of sample 0 [ns since 1970]
+    rate: float  # sampling rate [Hz]
     #: (n, 3): first sample, first row, length; sorted by sample, without overlap.
     runs: Integers
     #: (n, 5): cause (number in schema.GAP_CAUSES), sample, row, stamp before [ns], stamp [ns];
@@ -86,17 +87,18 @@ class Placement:
 
 
 def make_placement(
-    start: int, runs: list[Integers], events: list[Integers], wander: float = 0.0
+    start: int, rate: float, runs: list[Integers], events: list[Integers], wander: float = 0.0
 ) -> Placement:
     """Make a placement of lists of runs and events, sorted by sample."""
     table = np.concatenate(runs)
     happened = np.concatenate([*events, np.empty((0, 5), dtype=np.int64)])
     table = table[np.argsort(table[:, 0], kind="stable")]
-    return Placement(start, table, happened[np.argsort(happened[:, 1], kind="stable")], wander)
+    happened = happened[np.argsort(happened[:, 1], kind="stable")]
+    return Placement(start, rate, table, happened, wander)
 
 
 def check_grid(
-    raw: xr.Dataset, placement: Placement, rate: float, max_gap: float, limits: Mapping[str, float]
+    raw: xr.Dataset, placement: Placement, max_gap: float, limits: Mapping[str, float]
 ) -> None:
     """Refuse a grid with far more samples than rows, before it is allocated."""
     if not is_absurd_grid(placement.size, placement.placed, limits):
@@ -109,7 +111,7 @@ def check_grid(
         f"{format_stamp(int(read_stamps(raw, row, row + 1)[0]))} (row {file_of(raw, row)[1]})"
         for row in rows
     ]
-    gap = holes[widest] / rate
+    gap = holes[widest] / placement.rate
     if gap >= 1.0:
         fix = (
             "correct the stamp or the unit of the time column, or give --max-gap "
@@ -117,14 +119,14 @@ def check_grid(
         )
     else:
         fix = (
-            f"other stamps are {format_duration(1.0 / rate)} apart, too close for a log of "
-            "that length: correct them or the unit of time"
+            f"other stamps are {format_duration(1.0 / placement.rate)} apart, too close for a log "
+            "of that length: correct them or the unit of time"
         )
     raise TimeError(
         f"{file_of(raw, rows[0])[0]}: from {places[0]} to {places[1]} there are "
         f"{format_duration(gap)} without samples, and the grid of "
-        f"{rate:.10g} Hz would have {placement.size:.4g} samples for {placement.placed:,} rows; "
-        f"{fix}. If the stamps are right: "
+        f"{placement.rate:.10g} Hz would have {placement.size:.4g} samples for "
+        f"{placement.placed:,} rows; {fix}. If the stamps are right: "
         f"{describe_limit('grid_samples', placement.size, limits)}"
     )
 
@@ -162,7 +164,7 @@ def place_by_stamp(stamps: Stamps, rate: float, *, max_gap: float, where: str) -
     if not state[kernel.STARTED]:
         raise TimeError(NO_STAMPS.format(where=where))
     runs.append(state[kernel.OPEN_RUN][None])
-    return make_placement(_find_start(first, period), runs, events)
+    return make_placement(_find_start(first, period), rate, runs, events)
 
 
 def _find_start(stamps: Integers, period: float) -> int:
@@ -273,7 +275,7 @@ def place_by_count(
     runs, cut_rows = _counted_runs(stamps, np.array(cuts), np.array(shifts))
     numbers = np.array(events, dtype=np.int64).reshape(-1, 5)
     numbers[:, 2] = cut_rows[numbers[:, 2]]
-    return make_placement(start, runs, [numbers], wander)
+    return make_placement(start, rate, runs, [numbers], wander)
 
 
 def _counted_runs(

@@ -180,4 +180,4 @@ def place_in_order(
         placer.add(rows, count, values, size if len(rows) == size + ahead else len(rows))
     if placer.start is None:
         raise TimeError(NO_STAMPS.format(where=where))
-    return make_placement(placer.start, placer.runs, placer.events)
+    return make_placement(placer.start, rate, placer.runs, placer.events)

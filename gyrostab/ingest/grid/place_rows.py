@@ -61,8 +61,8 @@ class RowPlacer:
     declared: float | None  # sampling rate [Hz]; found from the stamps if None
     max_gap: float  # a longer step ahead is a step of the clock [s]
 
-    def place(self) -> tuple[Placement, float, list[str]]:
-        """Return the placement, the sampling rate [Hz] and notes."""
+    def place(self) -> tuple[Placement, list[str]]:
+        """Return the placement and notes."""
         return self._place_even() or self._place_all()
 
     @property
@@ -70,7 +70,7 @@ class RowPlacer:
         """File of the first row, for messages."""
         return file_of(self.raw)[0]
 
-    def _place_even(self) -> tuple[Placement, float, list[str]] | None:
+    def _place_even(self) -> tuple[Placement, list[str]] | None:
         """Place rows with evenly spaced stamps of a plain rate, without reading the stamps.
 
         Returns None if the stamps are not even, a row has no sample, or another rate is given.
@@ -85,9 +85,9 @@ class RowPlacer:
         if period_ns(rate) != (step, 0.0) or self.declared not in (None, rate):
             return None
         runs = [np.array([[0, 0, scanned.rows]], dtype=np.int64)]
-        return make_placement(start, runs, []), rate, []
+        return make_placement(start, rate, runs, []), []
 
-    def _place_all(self) -> tuple[Placement, float, list[str]]:
+    def _place_all(self) -> tuple[Placement, list[str]]:
         raw, scanned, declared = self.raw, self.scanned, self.declared
         if "time" not in raw.variables:
             return self._place_without_time()
@@ -115,16 +115,16 @@ class RowPlacer:
             placement = self._place_stamped(stamps, estimate.jitter, rate, count_all_rows)
             if _is_sharp(estimate.jitter):
                 deviating = deviating_stretches(stamps, 1e9 / rate)
-        notes += describe_rate(raw, estimate, rate, deviating, placement)
+        notes += describe_rate(raw, estimate, deviating, placement)
         changes = tuple(
             end[1]
             for stretch in deviating
             if abs(stretch.rate / rate - 1) > _MAX_RATE_DIFFERENCE
             for end in stretch[:2]
         )
-        return replace(placement, rate_changes=changes), rate, notes
+        return replace(placement, rate_changes=changes), notes
 
-    def _place_without_time(self) -> tuple[Placement, float, list[str]]:
+    def _place_without_time(self) -> tuple[Placement, list[str]]:
         """Place rows without stamps from the given start."""
         if self.declared is None:
             raise TimeError(
@@ -136,8 +136,8 @@ class RowPlacer:
             "1970-01-01T00:00:00"
         )
         runs = [np.array([[0, 0, self.scanned.rows]], dtype=np.int64)]
-        placement = make_placement(stamp_ns(text) if text else 0, runs, [])
-        return placement, self.declared, [] if text else [note]
+        placement = make_placement(stamp_ns(text) if text else 0, self.declared, runs, [])
+        return placement, [] if text else [note]
 
     def _estimate_declared(
         self, stamps: Stamps, estimate: RateEstimate, declared: float
@@ -193,7 +193,7 @@ class RowPlacer:
         """Place each sample once; repeated stretches of rows are duplicates, not clock restarts."""
         placement, all_repeats = place(), np.empty((0, 3), dtype=np.int64)
         for _ in range(_MAX_ROUNDS):
-            repeats = find_repeats(self.raw, signal_name(self.raw), placement)
+            repeats = find_repeats(self.raw, placement)
             if not len(repeats):
                 break
             for row, _source, length in repeats.tolist():
@@ -207,7 +207,7 @@ def _is_sharp(jitter: JitterModel | None) -> bool:
     return jitter is None or jitter.sigma <= _SHARP_SIGMA
 
 
-def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> Integers:
+def find_repeats(raw: xr.Dataset, placement: Placement) -> Integers:
     """Find the rows after each set-back of the clock that repeat rows before it.
 
     Rows are equal if their stamps and values are. A clock that restarts may write the same stamps
@@ -222,7 +222,7 @@ def find_repeats(raw: xr.Dataset, name: str, placement: Placement) -> Integers:
         if repeats and row < repeats[-1][0] + repeats[-1][2]:
             continue
         for source in _rows_at(raw, stamp, row):
-            length = _count_repeated(raw, name, source, row)
+            length = _count_repeated(raw, source, row)
             if length >= _MIN_ROWS:
                 repeats.append((row, source, length))
                 break
@@ -247,11 +247,12 @@ def _rows_at(raw: xr.Dataset, stamp: int, end_row: int) -> list[int]:
     return rows[:_MAX_CANDIDATES]
 
 
-def _count_repeated(raw: xr.Dataset, name: str, source: int, row: int) -> int:
+def _count_repeated(raw: xr.Dataset, source: int, row: int) -> int:
     """Return how many rows from `row` on repeat those from `source` on, 0 if none do.
 
     Their stamps are equal, and their values where both are known, but not constant.
     """
+    signal = raw[signal_name(raw)].data
     compared = same = length = 0
     changes = False
     for begin, end in _growing_blocks(min(raw.sizes["row"] - row, row - source)):
@@ -259,9 +260,7 @@ def _count_repeated(raw: xr.Dataset, name: str, source: int, row: int) -> int:
             raw, row + begin, row + end
         )
         length = begin + int(differ.argmax()) if differ.any() else end
-        left, right = (
-            read_slice(raw[name].data, first + begin, first + length) for first in (source, row)
-        )
+        left, right = (read_slice(signal, first + begin, first + length) for first in (source, row))
         known, equal_rows = count_alike(left, right)
         compared, same = compared + int(known), same + int(equal_rows)
         changes = changes or bool((np.abs(np.diff(left, axis=1)) > 0).any())

@@ -87,7 +87,7 @@ def _is_on_grid(channel: Any, n_filled: int, scanned: ScanPass, placement: Place
 
 
 def _place_channels(
-    raw: xr.Dataset, scanned: ScanPass, placement: Placement, rate: float, chunk: int
+    raw: xr.Dataset, scanned: ScanPass, placement: Placement, chunk: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the channels on the grid, and time coordinates of slow channels."""
     variables: dict[str, Any] = {}
@@ -102,7 +102,7 @@ def _place_channels(
                 channel.encoding,
             )
         elif rows:
-            time, values = gather_channel(raw, name, placement, rate)
+            time, values = gather_channel(raw, name, placement)
             variables[name] = (f"time_{name}", values, channel.attrs, channel.encoding)
             coordinates[f"time_{name}"] = time
     for key, variable in raw.data_vars.items():
@@ -248,15 +248,14 @@ def regularise(
     scanned = scan_rows(raw, name)
     given = rate if rate is not None else raw.attrs.get("declared_rate_hz")
     declared = None if given is None else float(given)
-    placer = RowPlacer(raw, scanned, declared, gap_limit)
-    placement, hertz, notes = placer.place()
-    check_grid(raw, placement, hertz, gap_limit, allowed)
-    check_span(placement.start, hertz, placement.size, file_of(raw)[0])
+    placement, notes = RowPlacer(raw, scanned, declared, gap_limit).place()
+    check_grid(raw, placement, gap_limit, allowed)
+    start, hertz, size = placement.start, placement.rate, placement.size
+    check_span(start, hertz, size, file_of(raw)[0])
     chunk = chunk_samples(hertz)
-    table = name_lost(
-        find_gaps(placement, scanned), raw.attrs.get("unreadable_spans", ()), placement.start, hertz
-    )
-    notes += describe_placement(raw, scanned, placement, table, hertz)
+    lost_spans = raw.attrs.get("unreadable_spans", ())
+    table = name_lost(find_gaps(placement, scanned), lost_spans, start, hertz)
+    notes += describe_placement(raw, scanned, placement, table)
     increments = raw.attrs.get("kind") == "increment"
     if name == "angle":
         notes += [*turns, *describe_angles(raw)]
@@ -269,27 +268,25 @@ def regularise(
     signal = "rate" if increments else name
     if _has_unknown_turns(table, known_steps):
         data, packing, signal = differentiate_angles(data, to_rate), {}, "rate"
-        table = _end_gaps_later(table, placement.size)
+        table = _end_gaps_later(table, size)
         notes.append(
             f"{record_name(raw)}: an angle wraps around, and how often it does while samples are "
             "missing is not known; so the log holds rates, each the mean since the sample before, "
             "and none directly after missing samples"
         )
     attributes = {**raw[name].attrs, "units": SIGNAL_UNITS[signal]}
-    variables, channel_times = _place_channels(raw, scanned, placement, hertz, chunk)
+    variables, channel_times = _place_channels(raw, scanned, placement, chunk)
     variables = {
         signal: (("axis", "time"), data, attributes, packing),
         **variables,
-        **gap_variables(sort_gaps(table), placement.start, hertz),
+        **gap_variables(sort_gaps(table), start, hertz),
     }
     coordinates = (
         xr.Coordinates({"axis": raw["axis"].variable, **channel_times})
-        .merge(time_coordinate(placement.start, hertz, placement.size))
+        .merge(time_coordinate(start, hertz, size))
         .coords
     )
-    done = (
-        f"{placement.placed} of {scanned.rows} rows on {placement.size} samples at {hertz:.10g} Hz"
-    )
+    done = f"{placement.placed} of {scanned.rows} rows on {size} samples at {hertz:.10g} Hz"
     log = xr.Dataset(variables, coordinates, _log_attributes(raw, signal, hertz, done, notes))
     if placement.rate_changes:
         log.attrs["rate_changes"] = list(map(format_stamp, placement.rate_changes))
@@ -323,14 +320,14 @@ def rows_on_grid(
 
 
 def gather_channel(
-    raw: xr.Dataset, name: str, placement: Placement, rate: float
+    raw: xr.Dataset, name: str, placement: Placement
 ) -> tuple[NDArray[np.datetime64], NDArray[np.float64]]:
     """Return stamps and values of the filled rows of a slow channel."""
     channel = raw[name].data
     breaks = placement.events[np.isin(placement.events[:, 0], (STEP, RESTART))]
     breaks = breaks[np.argsort(breaks[:, 2], kind="stable")]
     moved = np.concatenate(
-        [[0], grid_times(placement.start, rate, breaks[:, 1] + 1) - breaks[:, 4]]
+        [[0], grid_times(placement.start, placement.rate, breaks[:, 1] + 1) - breaks[:, 4]]
     )
     stamps, values = [], []
     for begin in range(0, channel.shape[0], BLOCK_ROWS):
@@ -339,7 +336,7 @@ def gather_channel(
         rows = np.flatnonzero(np.isfinite(block))
         sample = placement.samples_of(rows + begin)
         has_time = sample >= 0
-        when = grid_times(placement.start, rate, sample)
+        when = grid_times(placement.start, placement.rate, sample)
         if "time" in raw.variables and not has_time.all():
             written = read_stamps(raw, begin, end)[rows]
             moved_stamps = (
