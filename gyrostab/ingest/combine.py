@@ -177,15 +177,15 @@ def _in_order(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
 
 
 def _common_signal(parts: Sequence[xr.Dataset]) -> str | None:
-    first = parts[0]
-    for part in parts[1:]:
-        if part.attrs.get("kind") != first.attrs.get("kind"):
-            held, other = (f"of kind {log.attrs.get('kind')!r}" for log in (first, part))
-            names = [log.attrs["source_files"][0] for log in (first, part)]
+    """Return the name of the gyro signal of all files, None if they hold channels only."""
+    (name, kind), *others = [(p.attrs["source_files"][0], p.attrs.get("kind")) for p in parts]
+    for other_name, other_kind in others:
+        if other_kind != kind:
             raise UnitError(
-                f"{names[0]} holds a gyro signal {held}, {names[1]} {other}; read them one by one"
+                f"{name} holds a gyro signal of kind {kind!r}, {other_name} of kind "
+                f"{other_kind!r}; read them one by one"
             )
-    return next((name for name in SIGNAL_UNITS if name in first.data_vars), None)
+    return next((name for name in SIGNAL_UNITS if name in parts[0].data_vars), None)
 
 
 def _concatenate_parts(
@@ -275,17 +275,17 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
                 )
                 raise OptionError(f"channel {channel!r} of {name} is in the log too; {fix}")
             pieces.setdefault(channel, []).append((stamps, values, units))
-    for channel, (stamps, values, units) in (
-        (channel, zip(*parts, strict=True)) for channel, parts in pieces.items()
-    ):
+    for channel, parts in pieces.items():
+        stamps_of_files, values_of_files, units = zip(*parts, strict=True)
         if len(set(units)) > 1:
             raise UnitError(
                 f"channel {channel!r} has different units in {list_some(files)}; give one with "
                 f"--unit {channel}=UNIT"
             )
-        order, dim = np.argsort(np.concatenate(stamps), kind="stable"), f"time_{channel}"
-        log = log.assign_coords({dim: (dim, np.concatenate(stamps)[order])}).assign(
-            {channel: (dim, np.concatenate(values)[order], {"units": units[0]})}
+        stamps, values = np.concatenate(stamps_of_files), np.concatenate(values_of_files)
+        order, dim = np.argsort(stamps, kind="stable"), f"time_{channel}"
+        log = log.assign_coords({dim: (dim, stamps[order])}).assign(
+            {channel: (dim, values[order], {"units": units[0]})}
         )
     return log
 
