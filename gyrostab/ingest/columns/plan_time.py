@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from gyrostab.errors import GyrostabError, MissingUnitError, UnitError
 from gyrostab.ingest.columns.dates import (
     DAY_FIRST,
@@ -29,32 +31,7 @@ UNREADABLE = (NO_DATE, NAMED_ZONE)
 
 def find_time(plan: Plan, named: list[Header]) -> Header | None:
     """Choose the time column and its unit; other candidates are left out with a note."""
-    time_columns = [c for c in named if c.low == "time" and c.mapped] or [
-        c for c in named if c.low == "time" and c.preset
-    ]
-    if not time_columns:
-        time_columns = [
-            c for c in named if not c.is_named and TIME_PATTERN.match(c.low) and _may_be_time(c)
-        ]
-        sure = [c for c in time_columns if c.low != "t" or c.written or c.file.stamped]
-        time_columns = sure or time_columns
-    if not time_columns:
-        time_columns = [
-            c
-            for c in named
-            if c.file.stamped
-            and c.may_rise
-            and not c.is_named
-            and not (c.file.date_order in UNREADABLE and plan.options.rate is not None)
-        ]
-        reason = "it holds dates"
-        if not time_columns:
-            clocks = [c for c in named if _is_clock(c)]
-            time_columns = clocks if len(clocks) == 1 else []
-            reason = "it is the only column that rises in a unit of time"
-        if time_columns:
-            header = time_columns[0].header
-            plan.notes.append(f"{header!r} is taken for the time column, as {reason}")
+    time_columns = _find_by_name(named) or _find_by_content(plan, named)
     if not time_columns:
         return None
     column, *rivals = sorted(time_columns, key=lambda c: not c.may_rise)
@@ -92,6 +69,36 @@ def find_time(plan: Plan, named: list[Header]) -> Header | None:
             f"--epoch is not used: the time column {column.header!r} is in {unit.text!r}"
         )
     return column
+
+
+def _find_by_name(named: Sequence[Header]) -> list[Header]:
+    """Find the columns that are called time: by ``--map``, else by the preset, else in the file."""
+    called = [c for c in named if c.low == "time" and c.is_named]
+    if called:
+        return [c for c in called if c.mapped] or called
+    likely = [c for c in named if not c.is_named and TIME_PATTERN.match(c.low) and _may_be_time(c)]
+    return [c for c in likely if c.low != "t" or c.written or c.file.stamped] or likely
+
+
+def _find_by_content(plan: Plan, named: Sequence[Header]) -> list[Header]:
+    """Find the columns of dates, else the only column that rises in a unit of time, with a note."""
+    can_leave_out = plan.options.rate is not None
+    candidates = [
+        c
+        for c in named
+        if c.file.stamped
+        and c.may_rise
+        and not c.is_named
+        and not (can_leave_out and c.file.date_order in UNREADABLE)
+    ]
+    reason = "it holds dates"
+    if not candidates:
+        clocks = [c for c in named if _is_clock(c)]
+        candidates = clocks if len(clocks) == 1 else []
+        reason = "it is the only column that rises in a unit of time"
+    if candidates:
+        plan.notes.append(f"{candidates[0].header!r} is taken for the time column, as {reason}")
+    return candidates
 
 
 def _may_be_time(column: Header) -> bool:
