@@ -99,9 +99,8 @@ def _place_next(
     pieces: list[PlacedLog], source: Source, rate: float, max_gap: float
 ) -> tuple[PlacedLog, tuple[PlacedLog, Match] | None]:
     """Place the next log on the grid; also return the log that it overlaps, if any."""
-    ratio = rate / source.rate
     if not pieces:
-        return PlacedLog(source, runs_of(0, 0.0, source.size, ratio), 0.0, (source.start, 0)), None
+        return _place_at(0, source, rate, (source.start, 0)), None
     differing: tuple[PlacedLog, Match] | None = None
     silent: tuple[PlacedLog, Match] | None = None
     for held in reversed(pieces):
@@ -111,10 +110,7 @@ def _place_next(
         match = _match_logs(held.source, source, lag)
         if match.alike:
             first = int(held.on_grid(lag + match.shift))
-            return PlacedLog(source, runs_of(first, 0.0, source.size, ratio), 0.0, held.clock), (
-                held,
-                match,
-            )
+            return _place_at(first, source, rate, held.clock), (held, match)
         if match.common:
             differing = differing or (held, match)
         else:
@@ -122,21 +118,24 @@ def _place_next(
     clock = pieces[-1].clock
     position = float(grid_index(clock[0], rate, source.start)) + clock[1]
     first, end = int(np.rint(position)), max(piece.end for piece in pieces)
-    back, ahead = (
-        end - first > MAX_OVERLAP_SAMPLES and differing is not None,
-        first - end > max_gap * rate,
-    )
-    if back or ahead:
+    back = end - first > MAX_OVERLAP_SAMPLES and differing is not None
+    if back or first - end > max_gap * rate:
         ends = clock[0], _last_stamp(pieces), source.start
         is_new = back and is_restart(pieces[0].source.start, *ends)
         cause = RESTART if is_new else CLOCK_STEP
-        return PlacedLog(
-            source, runs_of(end + 1, 0.0, source.size, ratio), 0.0, (source.start, end + 1), cause
-        ), None
+        return _place_at(end + 1, source, rate, (source.start, end + 1), cause), None
+    overlapped = (differing or silent) if first < end else None
+    return _place_at(position, source, rate, clock), overlapped
+
+
+def _place_at(
+    position: float, source: Source, rate: float, clock: tuple[int, int], cause: int = -1
+) -> PlacedLog:
+    """Place a log whose first sample lies at a position of the grid of `rate` [Hz]."""
+    first = int(np.rint(position))
     off = position - first
-    return PlacedLog(source, runs_of(first, off, source.size, ratio), off, clock), (
-        differing or silent
-    ) if first < end else None
+    runs = runs_of(first, off, source.size, rate / source.rate)
+    return PlacedLog(source, runs, off, clock, cause)
 
 
 def _last_stamp(pieces: Sequence[PlacedLog]) -> int:
