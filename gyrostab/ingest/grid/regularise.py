@@ -239,45 +239,47 @@ def regularise(
         labels, note = _describe_axes(raw.attrs["axis_rows"], parts, logs)
         log = concatenate_logs(logs, labels, **options)
         return log.assign_attrs(notes=[*texts(raw, "notes"), *texts(log, "notes"), note])
-    gap_limit = duration_seconds(max_gap, "max_gap")
+    given = rate if rate is not None else raw.attrs.get("declared_rate_hz")
+    declared = None if given is None else float(given)
+    return _place_log(raw, declared, duration_seconds(max_gap, "max_gap"), check_limits(limits))
+
+
+def _place_log(
+    raw: xr.Dataset, declared: float | None, max_gap: float, limits: Mapping[str, float]
+) -> xr.Dataset:
+    """Place a raw log whose axes share their stamps; its rate [Hz] is found unless `declared`."""
     name = signal_name(raw)
-    allowed = check_limits(limits)
     turns, known_steps = list[str](), np.inf
     if name == "angle" and raw.attrs.get("kind") == "angle":
         raw, turns, known_steps = continue_angles(raw)
     scanned = scan_rows(raw, name)
-    given = rate if rate is not None else raw.attrs.get("declared_rate_hz")
-    declared = None if given is None else float(given)
-    placement, notes = RowPlacer(raw, scanned, declared, gap_limit).place()
-    check_grid(raw, placement, gap_limit, allowed)
+    placement, notes = RowPlacer(raw, scanned, declared, max_gap).place()
+    check_grid(raw, placement, max_gap, limits)
     start, hertz, size = placement.start, placement.rate, placement.size
     check_span(start, hertz, size, file_of(raw)[0])
     chunk = chunk_samples(hertz)
     lost_spans = raw.attrs.get("unreadable_spans", ())
     table = name_lost(find_gaps(placement, scanned), lost_spans, start, hertz)
     notes += describe_placement(raw, scanned, placement, table)
-    increments = raw.attrs.get("kind") == "increment"
     if name == "angle":
         notes += [*turns, *describe_angles(raw)]
 
+    is_increment = raw.attrs.get("kind") == "increment"
+    kind = "rate" if is_increment else name
     to_rate = hertz * HOUR  # degree a sample to degree an hour
-    scale = to_rate if increments else 1.0
-    unit = raw[name].encoding.get("scale_factor")
-    data = rows_on_grid(raw[name].data, placement, chunk=chunk, scale=scale, unit=unit)
-    packing = {**raw[name].encoding, "scale_factor": unit * scale} if unit else {}
-    signal = "rate" if increments else name
+    data, packing = _place_signal(raw[name], placement, chunk, to_rate if is_increment else 1.0)
     if _has_unknown_turns(table, known_steps):
-        data, packing, signal = differentiate_angles(data, to_rate), {}, "rate"
+        data, packing, kind = differentiate_angles(data, to_rate), {}, "rate"
         table = _end_gaps_later(table, size)
         notes.append(
             f"{record_name(raw)}: an angle wraps around, and how often it does while samples are "
             "missing is not known; so the log holds rates, each the mean since the sample before, "
             "and none directly after missing samples"
         )
-    attributes = {**raw[name].attrs, "units": SIGNAL_UNITS[signal]}
+    attributes = {**raw[name].attrs, "units": SIGNAL_UNITS[kind]}
     variables, channel_times = _place_channels(raw, scanned, placement, chunk)
     variables = {
-        signal: (("axis", "time"), data, attributes, packing),
+        kind: (("axis", "time"), data, attributes, packing),
         **variables,
         **gap_variables(sort_gaps(table), start, hertz),
     }
@@ -287,10 +289,19 @@ def regularise(
         .coords
     )
     done = f"{placement.placed} of {scanned.rows} rows on {size} samples at {hertz:.10g} Hz"
-    log = xr.Dataset(variables, coordinates, _log_attributes(raw, signal, hertz, done, notes))
+    log = xr.Dataset(variables, coordinates, _log_attributes(raw, kind, hertz, done, notes))
     if placement.rate_changes:
         log.attrs["rate_changes"] = list(map(format_stamp, placement.rate_changes))
     return log.assign_attrs(notes=[*log.attrs["notes"], *describe_channels(log)])
+
+
+def _place_signal(
+    signal: xr.DataArray, placement: Placement, chunk: int, scale: float
+) -> tuple[Any, dict[Any, Any]]:
+    """Place a signal by row on the grid, times `scale`; also return its encoding."""
+    unit = signal.encoding.get("scale_factor")
+    data = rows_on_grid(signal.data, placement, chunk=chunk, scale=scale, unit=unit)
+    return data, {**signal.encoding, "scale_factor": unit * scale} if unit else {}
 
 
 def _scale_samples(out: NDArray[np.float64], *, scale: float, unit: float | None) -> None:
