@@ -10,7 +10,8 @@ from __future__ import annotations
 import tempfile
 import threading
 from collections.abc import Mapping, Sequence
-from typing import IO, Any
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,22 +30,23 @@ class Spool:
     """An unlinked temporary file, which the system removes with the last reference to it."""
 
     def __init__(self) -> None:
-        self.file: IO[bytes] | None = None
         self.end = 0
         self._lock = threading.Lock()
 
-    def add(self, values: NDArray[Any]) -> int:
-        """Append a contiguous array and return its byte offset."""
+    @cached_property
+    def _file(self) -> Any:
+        return tempfile.TemporaryFile(prefix="gyrostab-", buffering=0)
+
+    def store(self, values: NDArray[Any]) -> SpooledPiece:
+        """Append a column of 8-byte values to the file."""
+        plain = np.ascontiguousarray(values)
         try:
             with self._lock:
-                if self.file is None:
-                    self.file = tempfile.TemporaryFile(prefix="gyrostab-", buffering=0)  # noqa: SIM115
-                begin, view = self.end, values.view(np.uint8).data
-                self.file.seek(begin)
+                begin, view = self.end, plain.view(np.uint8).data
+                self._file.seek(begin)
                 while view.nbytes:
-                    count = self.file.write(view)
+                    count = self._file.write(view)
                     view, self.end = view[count:], self.end + count
-                return begin
         except OSError as error:
             where = tempfile.gettempdir()
             raise OutputError(
@@ -52,30 +54,26 @@ class Spool:
                 f"be written ({error.strerror}); "
                 "make room, or name a larger place in the environment variable TMPDIR"
             ) from error
+        return SpooledPiece(self, begin, plain.shape, plain.dtype)
 
     def read_into(self, begin: int, out: NDArray[Any]) -> None:
         """Read the bytes of a contiguous array from an offset on; threads take turns."""
-        assert self.file is not None
         view = out.view(np.uint8).data
         with self._lock:
-            self.file.seek(begin)
+            self._file.seek(begin)
             while view.nbytes:
-                got: int = self.file.readinto(view)  # type: ignore[attr-defined]
+                got = self._file.readinto(view)
                 if not got:
                     raise OSError("the temporary file of a long log is shorter than it was")
                 view = view[got:]
-
-    def store(self, values: NDArray[Any]) -> SpooledPiece:
-        """Write a column of 8-byte values to the file."""
-        return SpooledPiece(self, np.ascontiguousarray(values))
 
 
 class SpooledPiece(RowSource):
     """Rows of a column in a spool, which take no memory."""
 
-    def __init__(self, spool: Spool, values: NDArray[Any]):
-        self.spool, self.begin = spool, spool.add(values)
-        self.shape, self.dtype = values.shape, values.dtype
+    def __init__(self, spool: Spool, begin: int, shape: tuple[int, ...], dtype: np.dtype[Any]):
+        self.spool, self.begin = spool, begin  # the byte at which the values begin
+        self.shape, self.dtype = shape, dtype
 
     def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
         """Read the values from `begin` on into `out`."""
@@ -138,7 +136,6 @@ class Buffers:
 
     def __init__(self, dtypes: Mapping[Any, Any]):
         self.dtypes = {key: np.dtype(dtype) for key, dtype in dtypes.items()}
-        self.limit = SPILL_BYTES
         self.rows = 0
         self._pieces: dict[Any, list[Piece]] = {key: [] for key in dtypes}
         self._spool: Spool | None = None
@@ -151,7 +148,7 @@ class Buffers:
                 self._as_piece(key, values) if isinstance(values, np.ndarray) else values
             )
         self.rows += next(iter(block.values())).shape[0] if block else 0
-        if self._spool is None and self._held > self.limit:
+        if self._spool is None and self._held > SPILL_BYTES:
             self._spool = spool = Spool()
             for column in self._pieces.values():
                 column[:] = [
