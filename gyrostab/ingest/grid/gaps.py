@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from gyrostab.ingest.gap_table import MISSING, OUTSIDE_RANGE, UNREADABLE, sort_lines
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, find_spans
-from gyrostab.ingest.uniform.core import add_spans, as_uniform, merge_spans, with_table
+from gyrostab.ingest.uniform.core import add_spans, as_uniform, grid_of, merge_spans, with_table
 from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART, STEP
 from gyrostab.schema import GAP_CAUSES, signal_name
-from gyrostab.time.grid import first_stamp
 
 
 def _missing_samples(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
@@ -137,8 +136,7 @@ def gap_table(log: xr.Dataset) -> pd.DataFrame:
     """
     log = as_uniform(log)
     if "gap_start" not in log.variables:
-        rate = float(log.attrs["sampling_rate_hz"])
-        log = with_table(log, _missing_spans(log), first_stamp(log), rate)
+        log = with_table(log, _missing_spans(log), grid_of(log)[0])
     start, end = log["gap_start"].values, log["gap_end"].values
     cause = np.array(GAP_CAUSES, dtype=object)[log["gap_cause"].values.astype(int)]
     samples = log["gap_samples"].values

@@ -174,21 +174,18 @@ def _with_true_table(
     log: xr.Dataset, grid: UniformGrid, declared: float | None, *, computed: bool
 ) -> xr.Dataset:
     """Return the log with a table of gaps that fits its time, or without one if that is unknown."""
-    table = read_gaps(log, grid.start, grid.rate)
-    if table is None:
-        return with_table(log, None, grid.start, grid.rate)
-    same_rate = declared is not None and abs(declared / grid.rate - 1) < 1e-9
-    if not same_rate and not (computed and declared is not None):
-        return with_table(
-            log, None, grid.start, grid.rate
-        )  # averaged samples have other gaps than selected ones
-    fitting = table if same_rate else _change_rate(table, log, declared, grid.start, grid.rate)  # type: ignore[arg-type]
+    table, fitting = read_gaps(log, grid.start, grid.rate), None
+    if table is not None and declared is not None:
+        if abs(declared / grid.rate - 1) < 1e-9:
+            fitting = table
+        elif computed:  # averaged samples have other gaps than selected ones
+            fitting = _change_rate(table, log, declared, grid)
+    if table is None or fitting is None:
+        return with_table(log, None, grid)
     fitting = clip_table(fitting, 0, grid.size)
     if len(grid.runs) > 1:
         fitting = _add_holes(fitting, grid.runs)
-    if fitting is table or np.array_equal(fitting, table):
-        return log
-    return with_table(log, fitting, grid.start, grid.rate)
+    return log if np.array_equal(fitting, table) else with_table(log, fitting, grid)
 
 
 def place_samples(log: xr.Dataset, grid: UniformGrid) -> xr.Dataset:
@@ -226,7 +223,7 @@ def place_samples(log: xr.Dataset, grid: UniformGrid) -> xr.Dataset:
     return placed_log
 
 
-def _change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rate: float) -> Table:
+def _change_rate(table: Table, log: xr.Dataset, old_rate: float, grid: UniformGrid) -> Table:
     """Convert the table for a log of which every n-th sample was selected.
 
     `table` is that of `read_gaps`, on the grid of the selected samples; `log` has the exact ends of
@@ -237,9 +234,8 @@ def _change_rate(table: Table, log: xr.Dataset, old_rate: float, start: int, rat
     table = table.copy()
     old_length = np.rint((columns[1] - columns[0]) * (old_rate / 1e9)).astype(np.int64)
     for column, stamps in ((FIRST, columns[0]), (END, columns[1])):
-        table[:, column] = np.ceil(
-            grid_index(start, rate, stamps) - 1e-6
-        )  # the first selected sample at or after it
+        # the first selected sample at or after it
+        table[:, column] = np.ceil(grid_index(grid.start, grid.rate, stamps) - 1e-6)
     length = table[:, END] - table[:, FIRST]
     share = np.divide(table[:, SAMPLES], old_length, out=np.zeros(len(table)), where=old_length > 0)
     lost = (table[:, SAMPLES] > 0) & (length == 0)  # between two selected samples
@@ -291,9 +287,9 @@ def add_spans(table: Table, spans: Table, cause: int) -> Table:
     return sort_gaps(np.concatenate([table, lines]))
 
 
-def with_table(log: xr.Dataset, table: Table | None, start: int, rate: float) -> xr.Dataset:
-    """Replace the table of gaps of a log; None removes it."""
+def with_table(log: xr.Dataset, table: Table | None, grid: UniformGrid) -> xr.Dataset:
+    """Replace the table of gaps of a log on this grid; None removes it."""
     bare = log.drop_vars(
         [name for name, variable in log.variables.items() if "gap" in variable.dims]
     )
-    return bare if table is None else bare.assign(gap_variables(table, start, rate))
+    return bare if table is None else bare.assign(gap_variables(table, grid.start, grid.rate))

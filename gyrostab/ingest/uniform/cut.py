@@ -131,7 +131,7 @@ def cut_log(
     part = _cut_samples(log, kept_grid, low)
     part = _cut_channels(part, grid_times(grid.start, grid.rate, kept_spans.ravel()))
     if "gap" in log.dims or len(excluded):
-        part = with_table(part, _cut_table(log, grid, low, kept_spans, excluded), start, grid.rate)
+        part = with_table(part, _cut_table(log, grid, low, kept_spans, excluded), kept_grid)
     options = [
         *([f"from {time_from}"] if time_from is not None else []),
         *([f"to {time_to}"] if time_to is not None else []),
