@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
@@ -98,32 +99,13 @@ def guess_columns(
     """
     reasons: list[str] = []
     warnings: list[str] = []
-    time, time_unit = (
-        (None, None) if inspection.time is not None else guess_time(inspection, reasons, warnings)
-    )
+    time, time_unit, assumed = None, None, None
+    if inspection.time is None:
+        time, time_unit = guess_time(inspection, reasons, warnings)
     if inspection.date_spans_s:
-        spans = sorted(inspection.date_spans_s.items(), key=lambda span: span[1])
-        (time_unit, span_s), (other, other_span_s) = spans
-        warnings.append(
-            f"--unit time={time_unit} is an assumption, because the dates can be read in two ways: "
-            f"use {other} {_compare_spans(span_s, other_span_s)}"
-        )
-    assumed = None
+        time_unit = _choose_order(inspection.date_spans_s, warnings)
     if inspection.time is None and time is None and rate is None:
-        assumed = rate_hint or TYPICAL_RATE_HZ
-        warnings.append(
-            f"the file names {assumed:g} Hz; if that is not its sampling rate, use the true rate "
-            "instead"
-            if rate_hint
-            else f"--rate {assumed:g} is an assumption, because the file has no time column: use "
-            "the true rate instead"
-        )
-        warnings += [
-            f"{column.key!r} rises from row to row in {column.unit}, which is not a unit of time: "
-            "if the log is over depth, export it over time"
-            for column in inspection.columns
-            if column.unit and not is_unit(column.unit) and rises_by_row(column, inspection)
-        ]
+        assumed = _assume_rate(inspection, rate_hint, warnings)
     sampling = (
         rate
         or assumed
@@ -143,24 +125,28 @@ def guess_columns(
         warnings.append(
             "no column looks like a gyro; if one is, name it: --map NAME=gyro_x --unit gyro=deg/s"
         )
-    axis_keys = {column.key for column in axes.values()}
-    temperatures = [c for c in inspection.columns if c.key not in axis_keys and _is_temperature(c)]
-    is_named = any(
-        column.role == "channel" and quantity_of(column.name) == "temperature"
-        for column in inspection.columns
-    )
     return Guess(
         axes,
         unit,
         time,
         time_unit,
         assumed,
-        temperatures[0] if len(temperatures) == 1 and not is_named else None,
+        _find_temperature(inspection, axes),
         tuple(reasons),
         tuple(warnings),
         sampling,
         guessed_kind,
     )
+
+
+def _choose_order(date_spans_s: Mapping[str, float], warnings: list[str]) -> str:
+    """Choose the order of day and month by which a file is shortest."""
+    (order, span_s), (other, other_span_s) = sorted(date_spans_s.items(), key=itemgetter(1))
+    warnings.append(
+        f"--unit time={order} is an assumption, because the dates can be read in two ways: "
+        f"use {other} {_compare_spans(span_s, other_span_s)}"
+    )
+    return order
 
 
 def _compare_spans(span_s: float, other_span_s: float) -> str:
@@ -171,6 +157,37 @@ def _compare_spans(span_s: float, other_span_s: float) -> str:
         return "only if most of its stamps are wrong"
     lengths = (format_duration(seconds, " ") for seconds in (other_span_s, span_s))
     return "if the file lasts {}, not {}".format(*lengths)
+
+
+def _assume_rate(inspection: FileInspection, rate_hint: float | None, warnings: list[str]) -> float:
+    """Return a sampling rate [Hz] for a file without time: that of its text, or a usual one."""
+    rate = rate_hint or TYPICAL_RATE_HZ
+    warnings.append(
+        f"the file names {rate:g} Hz; if that is not its sampling rate, use the true rate instead"
+        if rate_hint
+        else f"--rate {rate:g} is an assumption, because the file has no time column: use the true "
+        "rate instead"
+    )
+    warnings += [
+        f"{column.key!r} rises from row to row in {column.unit}, which is not a unit of time: if "
+        "the log is over depth, export it over time"
+        for column in inspection.columns
+        if column.unit and not is_unit(column.unit) and rises_by_row(column, inspection)
+    ]
+    return rate
+
+
+def _find_temperature(
+    inspection: FileInspection, axes: Mapping[str, ColumnInspection]
+) -> ColumnInspection | None:
+    """Return the only temperature beyond the axes, unless the file names one."""
+    axis_keys = {column.key for column in axes.values()}
+    temperatures = [c for c in inspection.columns if c.key not in axis_keys and _is_temperature(c)]
+    is_named = any(
+        column.role == "channel" and quantity_of(column.name) == "temperature"
+        for column in inspection.columns
+    )
+    return temperatures[0] if len(temperatures) == 1 and not is_named else None
 
 
 def _guess_axes(
