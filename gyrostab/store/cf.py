@@ -150,7 +150,7 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
     variables: dict[Any, xr.Variable] = {}
     grids = parse_time_grids(stored.variables, where)
     axes, close = make_time_axes(stored.sizes, grids, where), close_function(stored)
-    dims: dict[Any, Any] = {index_dim(rule["dim"]): rule["dim"] for rule in grids.values()}
+    dims: dict[Any, Any] = {index_dim(dim): dim for grid in grids.values() for dim in grid.dims}
     for name, variable in stored.variables.items():
         if name in grids:
             continue
@@ -179,7 +179,7 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
     for name, axis in axes.items():
         coords |= axis.variables
         indexes |= axis.xindexes
-        coords[grids[name]["dim"]].attrs = json.loads(
+        coords[grids[name].dims[0]].attrs = json.loads(
             stored.variables[name].attrs.get("axis_attributes", "{}")
         )
     dataset = xr.Dataset(

@@ -27,7 +27,7 @@ from gyrostab.store.lazy import FileVariable, RowSource, make_dask
 from gyrostab.store.private import close_function
 from gyrostab.store.remote import ROOT_METADATA, find_kind, find_url, reaching
 from gyrostab.store.times import decode_stamps, index_dim, parse_time_grids, replace_stamps
-from gyrostab.time.grid import grid_times
+from gyrostab.time.grid import GridTransform
 from gyrostab.wording import list_some
 
 #: Values from which a variable is a dask array.
@@ -218,15 +218,11 @@ def _is_sampled(variable: xr.Variable) -> bool:
 
 def _find_chunk_spans(
     stored: xr.Dataset, dim: str, length: int, path: Path
-) -> dict[str, Any] | tuple[tuple[int, int], ...]:
-    """Find the rule of a computed time axis, or the first and last stamp [ns] of each chunk."""
-    rules = {
-        name: rule
-        for rule in parse_time_grids(stored.variables, path).values()
-        for name in (rule["dim"], index_dim(rule["dim"]))
-    }
-    if dim in rules:
-        return rules[dim]
+) -> GridTransform | tuple[tuple[int, int], ...]:
+    """Find the grid of a computed time axis, or the first and last stamp [ns] of each chunk."""
+    for grid in parse_time_grids(stored.variables, path).values():
+        if dim in (grid.dims[0], index_dim(grid.dims[0])):
+            return grid
     if dim not in stored.variables:
         return ()
     stamps = decode_stamps(stored.variables[dim]).values.view(np.int64)
@@ -248,7 +244,7 @@ class _ChunkedVariable(RowSource):
     length: int
     scale: float | None
     missing: Any
-    spans: dict[str, Any] | tuple[tuple[int, int], ...]
+    spans: GridTransform | tuple[tuple[int, int], ...]
     strict: bool
     opened: str
     zarr: bool
@@ -295,10 +291,9 @@ class _ChunkedVariable(RowSource):
 
     def _handle_damage(self, row: int, number: int, damage: str) -> None:
         """Warn of a damaged chunk, once, or raise `FormatError`."""
-        if isinstance(self.spans, dict):
-            grid, end = self.spans, min((number + 1) * self.length, self.shape[-1])
-            ends = grid["first"] + grid["stride"] * np.array([number * self.length, end - 1])
-            span = grid_times(grid["start_ns"], grid["rate_hz"], ends)
+        if isinstance(self.spans, GridTransform):
+            end = min((number + 1) * self.length, self.shape[-1])
+            span = self.spans.stamps_at([number * self.length, end - 1])
         else:
             span = np.array(self.spans[number] if self.spans else (), dtype=np.int64)
         when = " to ".join(

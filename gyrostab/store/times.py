@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError, SchemaError
 from gyrostab.store.damage import check_blosc_chunks
 from gyrostab.store.lazy import RowSource, make_dask
-from gyrostab.time.grid import TimeGridIndex, grid_times, period_ns, time_coordinate
+from gyrostab.time.grid import GridTransform, TimeGridIndex, period_ns
 from gyrostab.time.stamps import to_nanoseconds
 
 #: Attribute with the rule of a computed time axis, on the variable that holds its first stamp.
@@ -47,7 +47,7 @@ def index_dim(dim: Any) -> str:
     return f"{dim}_index"
 
 
-def find_time_grids(dataset: xr.Dataset) -> dict[Any, Any]:
+def find_time_grids(dataset: xr.Dataset) -> dict[Any, GridTransform]:
     """Find the rules of the computed time axes."""
     grids = {
         name: index.transform
@@ -67,7 +67,7 @@ def find_time_grids(dataset: xr.Dataset) -> dict[Any, Any]:
     return grids
 
 
-def encode_first_stamp(grid: Any, attrs: dict[Any, Any], divisor: int) -> xr.Variable:
+def encode_first_stamp(grid: GridTransform, attrs: dict[Any, Any], divisor: int) -> xr.Variable:
     """Encode a computed time axis: its first stamp, with rate and exact rule as attributes."""
     (dim,) = grid.dims
     attributes = {
@@ -84,7 +84,7 @@ def encode_first_stamp(grid: Any, attrs: dict[Any, Any], divisor: int) -> xr.Var
     )
 
 
-def encode_all_stamps(grid: Any, attrs: dict[Any, Any], divisor: int) -> xr.Variable:
+def encode_all_stamps(grid: GridTransform, attrs: dict[Any, Any], divisor: int) -> xr.Variable:
     """Encode a computed time axis as a lazy CF coordinate, with its exact rule as an attribute."""
     (dim,) = grid.dims
     attributes = {"long_name": "time", "standard_name": "time"}
@@ -95,7 +95,7 @@ def encode_all_stamps(grid: Any, attrs: dict[Any, Any], divisor: int) -> xr.Vari
     )
 
 
-def _encode_rule(grid: Any, attrs: dict[Any, Any]) -> dict[str, str]:
+def _encode_rule(grid: GridTransform, attrs: dict[Any, Any]) -> dict[str, str]:
     (dim,) = grid.dims
     rule = {
         "dim": dim,
@@ -114,7 +114,7 @@ def _encode_rule(grid: Any, attrs: dict[Any, Any]) -> dict[str, str]:
 class _GridStamps(RowSource):
     """Stamps of a computed time axis, in whole units of `divisor` nanoseconds since 1970."""
 
-    def __init__(self, grid: Any, divisor: int):
+    def __init__(self, grid: GridTransform, divisor: int):
         self.grid, self.divisor = grid, divisor
         self.shape, self.dtype = (grid.size,), np.dtype(np.int64)
 
@@ -124,7 +124,7 @@ class _GridStamps(RowSource):
 
 
 def has_whole_microseconds(
-    dataset: xr.Dataset, grids: dict[Any, Any], *, stamps: bool = False
+    dataset: xr.Dataset, grids: Mapping[Any, GridTransform], *, stamps: bool = False
 ) -> bool:
     """Whether microseconds represent every time exactly; fewer programs read nanoseconds."""
     for name, variable in dataset.variables.items():
@@ -153,7 +153,7 @@ def encode_stamps(name: Any, variable: xr.Variable, divisor: int) -> NDArray[np.
 
 def parse_time_grids(
     variables: Mapping[Any, xr.Variable], where: object
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, GridTransform]:
     """Parse the rules of the computed time axes that a file declares, by name of the variable."""
     declared = {
         str(name): variable.attrs[GRID]
@@ -162,14 +162,14 @@ def parse_time_grids(
     }
     try:
         return {name: _parse_grid(text) for name, text in declared.items()}
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise FormatError(
             f"{where}: the rule of its time axis, attribute {GRID!r}, is damaged ({error}); "
             "copy it again"
         ) from error
 
 
-def _parse_grid(text: Any) -> dict[str, Any]:
+def _parse_grid(text: Any) -> GridTransform:
     """Parse the rule of a time axis; `ValueError` when `to_disk` did not write it."""
     rule = json.loads(text)
     kinds = {
@@ -187,33 +187,32 @@ def _parse_grid(text: Any) -> dict[str, Any]:
     ]
     if wrong:
         raise ValueError(f"no {' and no '.join(wrong)}")
-    rate, size, stride = rule["rate_hz"], rule["size"], rule["stride"]
+    start, rate, size = rule["start_ns"], rule["rate_hz"], rule["size"]
+    first, stride = rule["first"], rule["stride"]
     if not (0 < rate < math.inf and size >= 0 and stride > 0):
         raise ValueError(f"{text}")
-    ends = (rule["first"] + stride * n for n in (0, max(size, 1) - 1))
-    if any(abs(rule["start_ns"] + n * 1e9 / rate) >= 2.0**63 for n in ends):
+    ends = (first + stride * n for n in (0, max(size, 1) - 1))
+    if any(abs(start + n * 1e9 / rate) >= 2.0**63 for n in ends):
         raise ValueError("it leaves the years 1678 to 2262")
-    return dict(rule)
+    return GridTransform(start, rate, range(first, first + stride * size, stride), rule["dim"])
 
 
 def make_time_axes(
-    sizes: Mapping[Any, int], grids: dict[str, dict[str, Any]], where: str
+    sizes: Mapping[Any, int], grids: Mapping[str, GridTransform], where: str
 ) -> dict[str, xr.Coordinates]:
     """Make the coordinates of the computed time axes, by name of the declaring variable."""
     axes = {}
-    for name, rule in grids.items():
-        dim = rule["dim"]
+    for name, grid in grids.items():
+        (dim,) = grid.dims
         size = sizes.get(index_dim(dim), sizes.get(dim, 0))
-        if size != rule["size"]:
+        if size != grid.size:
             raise FormatError(
                 f"{where}: has {size} samples on {index_dim(dim)!r}, but was written with "
-                f"{rule['size']}: some other program has cut it, and its times are lost; "
+                f"{grid.size}: some other program has cut it, and its times are lost; "
                 "cut it in Python with gyrostab.open_log(...).isel or .sel, "
                 "and write it with gyrostab.to_netcdf"
             )
-        first, stride = rule["first"], rule["stride"]
-        samples = range(first, first + stride * size, stride)
-        axes[name] = time_coordinate(rule["start_ns"], rule["rate_hz"], samples, name=dim)
+        axes[name] = xr.Coordinates.from_xindex(TimeGridIndex(grid))
     return axes
 
 
@@ -223,11 +222,11 @@ def replace_stamps(stored: xr.Dataset, where: object) -> xr.Dataset:
     A rule that another program has left unchanged with other stamps is dropped: `stored` then has
     an ordinary time coordinate.
     """
-    for name, rule in parse_time_grids(stored.variables, where).items():
+    for name, grid in parse_time_grids(stored.variables, where).items():
         stamps = stored.variables[name]
         if not stamps.ndim:
             continue
-        if _has_stamps_of(rule, stamps, Path(str(where)) / name):
+        if _has_stamps_of(grid, stamps, Path(str(where)) / name):
             start = xr.Variable((), 0, stamps.attrs)
             stored = stored.drop_vars(name).assign({f"{name}_start": start})
         else:
@@ -239,19 +238,18 @@ def replace_stamps(stored: xr.Dataset, where: object) -> xr.Dataset:
     return stored
 
 
-def _has_stamps_of(rule: dict[str, Any], stamps: xr.Variable, folder: Path) -> bool:
+def _has_stamps_of(grid: GridTransform, stamps: xr.Variable, folder: Path) -> bool:
     """Whether stamps on disk agree in number and at both ends with a rule, or are damaged.
 
     `folder` holds the chunks of the stamps of a Zarr store.
     """
-    if stamps.shape != (rule["size"],):
+    if stamps.shape != (grid.size,):
         return False
     try:
         check_blosc_chunks(folder)
-        ends = np.unique([0, rule["size"] - 1]) if rule["size"] else np.empty(0, np.int64)
+        ends = np.unique([0, grid.size - 1]) if grid.size else np.empty(0, np.int64)
         written = to_nanoseconds(decode_stamps(stamps[ends]).values)
-        samples = rule["first"] + rule["stride"] * ends
-        return np.array_equal(written, grid_times(rule["start_ns"], rule["rate_hz"], samples))
+        return np.array_equal(written, grid.stamps_at(ends))
     except Exception:  # damaged stamps, for which the libraries raise errors of many kinds
         return True
 

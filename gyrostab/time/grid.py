@@ -126,7 +126,7 @@ def first_stamp(log: xr.Dataset) -> int:
     return int(to_nanoseconds(log.variables["time"][0].values).ravel()[0])
 
 
-class _GridTransform(CoordinateTransform):
+class GridTransform(CoordinateTransform):
     """Transform from position to stamp, for some evenly spaced `samples` of a grid."""
 
     def __init__(self, start: int, rate: float, samples: range, name: str):
@@ -135,6 +135,7 @@ class _GridTransform(CoordinateTransform):
 
     @property
     def size(self) -> int:
+        """Number of samples."""
         return len(self.samples)
 
     def stamps_at(self, positions: Any) -> NDArray[np.int64]:
@@ -148,22 +149,25 @@ class _GridTransform(CoordinateTransform):
         return np.asarray((sample - self.samples.start) / self.samples.step)
 
     def forward(self, dim_positions: dict[str, Any]) -> dict[Any, Any]:
+        """Return the stamps of positions, by name of the coordinate."""
         stamps = self.stamps_at(dim_positions[self.dims[0]])
         return {self.coord_names[0]: stamps.view("datetime64[ns]")}
 
     def reverse(self, coord_labels: dict[Any, Any]) -> dict[str, Any]:
+        """Return the positions of stamps, by dimension."""
         return {self.dims[0]: self.find_positions(coord_labels[self.coord_names[0]])}
 
     def equals(self, other: CoordinateTransform, *, exclude: frozenset[Any] | None = None) -> bool:
-        return isinstance(other, _GridTransform) and (self.start, self.rate, self.samples) == (
+        """Whether another transform has the same samples of the same grid."""
+        return isinstance(other, GridTransform) and (self.start, self.rate, self.samples) == (
             other.start,
             other.rate,
             other.samples,
         )
 
-    def select(self, samples: range) -> _GridTransform:
+    def select(self, samples: range) -> GridTransform:
         """Return other samples of the same grid."""
-        return _GridTransform(self.start, self.rate, samples, self.dims[0])
+        return GridTransform(self.start, self.rate, samples, self.dims[0])
 
     def end_stamps(self) -> NDArray[np.int64]:
         """Return the first and last stamp; two equal ones if there is none in between."""
@@ -192,7 +196,7 @@ def _wrap_positions(positions: dict[Any, Any]) -> Any:
 class TimeGridIndex(CoordinateTransformIndex):
     """Index of a uniform time axis: slices stay lazy, and labels are found by arithmetic."""
 
-    transform: _GridTransform
+    transform: GridTransform
 
     @property
     def start(self) -> int:
@@ -365,4 +369,4 @@ def time_coordinate(
           dtype='datetime64[ns]')
     """
     samples = samples if isinstance(samples, range) else range(samples)
-    return xr.Coordinates.from_xindex(TimeGridIndex(_GridTransform(start, rate, samples, name)))
+    return xr.Coordinates.from_xindex(TimeGridIndex(GridTransform(start, rate, samples, name)))
