@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
+from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.dates import find_order, holds_date
+from gyrostab.ingest.columns.dates import YEAR_FIRST, find_order, holds_date
 from gyrostab.ingest.columns.headers import FileColumn, split_header
 from gyrostab.ingest.columns.plan import Plan
 from gyrostab.ingest.columns.plan_roles import plan_columns
@@ -44,13 +44,14 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
 
     def fetch(source: int, start: int, stop: int) -> Any:
         is_whole = stop - start == rows
-        parts = file.iter_batches(
+        batches: Iterable[Any] = file.iter_batches(
             batch_size=batch_rows(1),
             row_groups=filled if is_whole else filled[:1] if start == 0 else filled[-1:],
             columns=[file.schema_arrow.names[source]],
         )
-        batches = islice(parts, 1) if start == 0 and not is_whole else parts
-        columns = [part.column(0) for part in deque(batches, maxlen=None if is_whole else 1)]
+        if not is_whole:  # rows of the first or of the last batch are enough
+            batches = islice(batches, 1) if start == 0 else deque(batches, maxlen=1)
+        columns = [batch.column(0) for batch in batches]
         if not columns:
             raise FormatError(
                 f"{path.name}: a row group holds fewer rows than the file says; copy it again"
@@ -90,15 +91,16 @@ def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
     head = next(file.iter_batches(batch_size=50), None)
     columns = []
     for index, entry in enumerate(schema):
-        unit = (entry.metadata or {}).get(b"units")
-        column = FileColumn(entry.name, None if unit is None else unit.decode(errors="replace"))
+        stored = (entry.metadata or {}).get(b"units")
+        header, unit = entry.name, None if stored is None else stored.decode(errors="replace")
         if pa.types.is_duration(entry.type):
-            column = FileColumn(split_header(entry.name)[0], entry.type.unit)
+            header, unit = split_header(entry.name)[0], entry.type.unit
         sample = () if head is None else _to_numpy(head.column(index))
         texts = [value for value in sample if isinstance(value, str)]
-        if any(map(holds_date, texts)):
-            column = replace(column, stamped=True, date_order=find_order(texts))
-        columns.append(replace(column, stamped=column.stamped or holds_dates(sample)))
+        is_dated = any(map(holds_date, texts))
+        order = find_order(texts) if is_dated else YEAR_FIRST
+        stamped = is_dated or holds_dates(sample)
+        columns.append(FileColumn(header, unit, stamped=stamped, date_order=order))
     return file, plan_columns(path, columns, options)
 
 
