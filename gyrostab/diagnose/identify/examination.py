@@ -35,7 +35,7 @@ NUISANCE_ALTERNATIVES = {
     "~S(f)": "the spectrum has another shape",
     "~outliers": "the distribution has heavy tails",
     "~cov": "the axes have noise in common",
-    "~red": "slow noise is stronger than calibrated",
+    "~red": "the bias wanders far beyond its noise",
 }
 Array = NDArray[Any]
 

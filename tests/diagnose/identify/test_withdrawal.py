@@ -123,12 +123,12 @@ def test_noisy_axes_are_not_correlated() -> None:
 
 
 @pytest.mark.slow
-def test_jump_and_ageing_are_withdrawn_in_a_stronger_drift():
+def test_an_axis_that_turns_without_a_channel_has_no_jump_and_no_ageing():
     turned = [0, 300, 900, 500, 1200, 800, 1100, 950, 1190, 700, 1000, 400, 0]  # deg/h, not logged
     noise = 0.5 * np.random.default_rng(1).standard_normal((1, 3600))
     noise += np.interp(np.arange(3600) / 10.0, np.linspace(0.0, 320.0, 13), turned)
     blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["y"]))
     identifications = name_effects(blocks, *nulls(blocks, 10))
     assert not identifications.identified
-    assert {unidentified.effect for unidentified in identifications.unknown} == {"~bias(t)"}
+    assert "~red" in {unidentified.effect for unidentified in identifications.unknown}
     assert {unidentified.axes for unidentified in identifications.unknown} == {("y",)}
