@@ -470,4 +470,4 @@ def test_a_cell_of_digits_without_end_is_no_stamp(tmp_path, capsys):
     path = write_log(tmp_path / "log.csv", change=lambda rows: [*rows[:-1], "9" * 5000 + ",1,1"])
     assert call("scan", path) == 0
     table = pd.read_csv(io.StringIO(capsys.readouterr().out), sep="\t", comment="#")
-    assert "1 of 6000 rows are unreadable: line 6001" in table.loc[0, "odd"]
+    assert "1 of 6000 rows are unreadable: line 6001 (" in table.loc[0, "odd"]

@@ -15,9 +15,9 @@ from gyrostab.ingest.columns.dates import DAY_FIRST, NAMED_ZONE, NO_DATE, YEAR_F
 from gyrostab.ingest.columns.stamps import (
     NAT,
     cells_to_ns,
-    from_fortran,
     is_number,
     parse_time_unit,
+    plain_number,
 )
 from gyrostab.schema import RESERVED_NAMES
 from gyrostab.units import known_units, parse_unit
@@ -91,7 +91,7 @@ class FileColumn:
         """Whether the first filled cells rise from row to row, as stamps do."""
         cells = [cell for cell in self.cells if cell.strip()]
         if all(map(is_number, cells)):
-            steps = np.diff([float(from_fortran(cell)) for cell in cells])
+            steps = np.diff([float(plain_number(cell)) for cell in cells])
         else:
             order = find_order(cells) or DAY_FIRST
             if order == NAMED_ZONE:

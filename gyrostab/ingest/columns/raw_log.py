@@ -35,7 +35,7 @@ _COMMON_CODES = (-999.25, -9999.0)
 
 #: Row numbers within a block -> names of the rows for messages.
 Locate = Callable[[Sequence[int]], list[str]]
-#: Row number within a block -> the row as it is written.
+#: Row number within a block -> the cell that cannot be read, or the row, as it is written.
 Quote = Callable[[int], str]
 Values = dict[int, NDArray[np.float64]]
 
@@ -130,7 +130,7 @@ class RawLogBuilder:
         first = self.buffers.rows
         locate = locate or (lambda rows: [f"row {first + row}" for row in rows])
         self.bad_rows.add(converted.bad_rows, locate, quote)
-        self.cell_rows.add(converted.cell_rows, locate)
+        self.cell_rows.add(converted.cell_rows, locate, quote)
         self.bad_cells += converted.bad_cells
         self.gyro_cells += converted.cells
         block: dict[int, Any] = {**converted.values}
@@ -188,13 +188,14 @@ class RawLogBuilder:
         """Refuse a file of which more than half of the rows are unreadable."""
         if self.bad_rows.total > MAX_UNREADABLE_SHARE * rows:
             share, first = self.bad_rows.total / rows, self.bad_rows.names[0]
+            written = f": {self.bad_rows.first}" if self.bad_rows.first else ""
             suspects = (
                 "the separator, the columns that --map names and the unit of time (stamps lie "
                 "in the years 1678 to 2262)"
             )
             raise FormatError(
                 f"{name}: {100 * share:.0f} % of {rows} rows are unreadable, the first is {first}"
-                f"{self.bad_rows.first}; look at it, and check {suspects}"
+                f"{written}; look at it, and check {suspects}"
             )
 
     def _describe_faults(self, rows: int) -> list[str]:
@@ -323,18 +324,18 @@ class _Places:
 
     def add(self, rows: NDArray[np.int64], locate: Locate, quote: Quote | None = None) -> None:
         if quote is not None and rows.size and not self.total:
-            self.first = f": {quote(int(rows[0])):.100}"
+            self.first = f"{quote(int(rows[0])):.100}"
         self.total += len(rows)
         if room := MAX_NAMED_PLACES - len(self.names):
             self.names += locate(rows[:room].tolist())
 
     def describe(self) -> str:
-        """Join the names: ``lines 7, 8, 9 and others``."""
+        """Join the names: ``lines 7 ('oops'), 8, 9 and others``."""
         kind, names = self.names[0].split(" ")[0], self.names
-        numbers = ", ".join(name.removeprefix(f"{kind} ") for name in names)
-        return (
-            f"{kind}{'s' * (len(names) > 1)} {numbers}{' and others' * (self.total > len(names))}"
-        )
+        numbers = [name.removeprefix(f"{kind} ") for name in names]
+        numbers[0] += f" ({self.first})" if self.first else ""
+        others = " and others" * (self.total > len(names))
+        return f"{kind}{'s' * (len(names) > 1)} {', '.join(numbers)}{others}"
 
 
 def describe_codes(columns: Sequence[Column], values: Mapping[int, Any]) -> list[str]:

@@ -205,13 +205,13 @@ def numbers_to_ns(values: NDArray[Any], unit: TimeUnit, epoch: int) -> NDArray[n
 
 def is_number(text: str, *, comma: bool = False) -> bool:
     """Return whether a cell holds a plain decimal number (no words, no ``nan``)."""
-    text = from_fortran(text.replace(",", ".") if comma else text).strip()
+    text = plain_number(text.replace(",", ".") if comma else text).strip()
     return len(text) <= _MAX_DIGITS and bool(_NUMBER.match(text))
 
 
-def from_fortran(text: str) -> str:
-    """Write the exponent of a number with E, where Fortran writes D."""
-    return text.upper().replace("D", "E")
+def plain_number(text: str) -> str:
+    """Write the exponent of a number with E, where Fortran writes D, and minus as a hyphen."""
+    return text.upper().replace("D", "E").replace("\N{MINUS SIGN}", "-")
 
 
 def cells_to_ns(
@@ -227,7 +227,7 @@ def cells_to_ns(
     stamps = np.full(len(cells), NAT, dtype=np.int64)
     for index, cell in enumerate(cells):
         if is_number(cell):
-            value = Fraction(from_fortran(cell.strip())) * unit.ns
+            value = Fraction(plain_number(cell.strip())) * unit.ns
             nanoseconds = round(value) + zero
             if abs(nanoseconds) <= _MAX_INT64:
                 stamps[index] = nanoseconds

@@ -34,7 +34,7 @@ from gyrostab.ingest.columns.plan_roles import plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, is_number
 from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.ingest.text.cells import BlockParser, ParsedBlock
+from gyrostab.ingest.text.cells import BlockParser, ParsedBlock, decode_line
 from gyrostab.ingest.text.layout import Layout, find_layout, is_text, unit_of_duration
 from gyrostab.store.threads import map_in_order
 
@@ -67,7 +67,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
         size = path.stat().st_size
         with path.open("rb") as file:
             file.seek(max(layout.offset, size - 2**14))
-            ends = [layout.split_row(line) for line in file.read().decode("latin-1").splitlines()]
+            ends = [layout.split_row(decode_line(line)) for line in file.read().splitlines()]
             if time is not None:
                 solid = [row for row in ends if _is_solid(row, layout, time.source)]
                 tail = _sample_stamps(layout, time, solid)
@@ -95,7 +95,8 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
     for parsed, converted in map_in_order(parse, blocks):
         if dates is not None:
             _check_fractions(parsed, f"{path.name}: ", line, dates)
-        builder.add(converted, partial(parsed.name_lines, line), parsed.quote_line)
+        quote = partial(parser.quote_fault, parsed)
+        builder.add(converted, partial(parsed.name_lines, line), quote)
         line += parsed.lines
     raw = builder.finish(layout.notes)
     if dates is not None:
@@ -116,7 +117,7 @@ def _check_fractions(parsed: ParsedBlock, where: str, line: int, time: Column) -
         return
     short_fractions = []
     for row in rows:
-        before, after = (_FRACTION.search(parsed.quote_line(at)) for at in (row, row + 1))
+        before, after = (_FRACTION.search(parsed.read_line(at)) for at in (row, row + 1))
         if before and after and before[1] == after[1] and len(before[2]) < len(after[2]):
             short_fractions += [(row, before[0], after[0])] * (int(before[2]) < int(after[2]))
     if len(short_fractions) > max(1, len(rows) / 2):

@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 from gyrostab.ingest.columns.dates import DAY_FIRST, YEAR_FIRST
 from gyrostab.ingest.columns.headers import VOID_CELLS
 from gyrostab.ingest.columns.plan import Plan
-from gyrostab.ingest.columns.stamps import cells_to_ns, from_fortran, integers_to_ns
+from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, integers_to_ns, plain_number
 from gyrostab.ingest.text.layout import BLANK, Layout
+
+#: A minus sign as .NET and ICU write it in some languages, such as Norwegian and Swedish.
+_MINUS_SIGN = "\N{MINUS SIGN}".encode()
 
 
 class ParsedBlock(NamedTuple):
@@ -33,10 +36,10 @@ class ParsedBlock(NamedTuple):
         above = (self.block.count(b"\n", 0, int(self.starts[row])) for row in rows)
         return [f"line {first + lines}" for lines in above]
 
-    def quote_line(self, row: int) -> str:
-        """Return a row as it is written, in quotes."""
+    def read_line(self, row: int) -> str:
+        """Return a row as it is written."""
         start = int(self.starts[row])
-        return repr(self.block[start : self.block.index(b"\n", start)].decode("latin-1").strip())
+        return decode_line(self.block[start : self.block.index(b"\n", start)]).strip()
 
 
 class BlockParser:
@@ -87,6 +90,8 @@ class BlockParser:
             if at == len(block):
                 break
             end = block.index(b"\n", at) + 1
+            if _MINUS_SIGN in block[at:end]:
+                return self.parse(block.replace(_MINUS_SIGN, b"-"))
             line = block[at:end].decode("latin-1").split("#")[0].strip("\r\n")
             if line.strip():
                 other_lines[row], starts[row] = line, at
@@ -98,6 +103,16 @@ class BlockParser:
         words = self._parse_cells(other_lines, values, stamps) if other_lines else 0
         columns = dict(zip(self.sources, values[:, :row], strict=True))
         return ParsedBlock(columns, stamps, words, block, starts[:row], lines)
+
+    def quote_fault(self, parsed: ParsedBlock, row: int) -> str:
+        """Quote the first cell of a row that cannot be read, or the row if none is filled."""
+        line = parsed.read_line(row)
+        faults = [source for source in self.sources if not np.isfinite(parsed.values[source][row])]
+        if self.time is not None and parsed.stamps is not None and parsed.stamps[row] == NAT:
+            faults.insert(0, self.time)
+        cells = self._split_row(line.split("#")[0]) or []
+        filled = (cells[at] for at in faults if cells and cells[at].lower() not in VOID_CELLS)
+        return repr(next(filled, line))
 
     def _parse_cells(
         self,
@@ -137,10 +152,18 @@ class BlockParser:
         return cells if len(cells) == width else None
 
 
+def decode_line(line: bytes) -> str:
+    """Decode a line as UTF-8, otherwise as Latin-1."""
+    try:
+        return line.decode("utf-8")
+    except UnicodeDecodeError:
+        return line.decode("latin-1")
+
+
 def _parse_number(cell: str, layout: Layout) -> float:
     text = cell.replace(",", ".") if layout.decimal_comma else cell
     try:
-        value = float(from_fortran(text))
+        value = float(plain_number(text))
     except ValueError:
         return np.nan
     return np.nan if "_" in cell else value

@@ -282,8 +282,9 @@ def test_unreadable_rows_are_counted_and_named_by_line(tmp_path: Path) -> None:
     assert ns(raw) == [0, 10**9, NAT, 3 * 10**9, 4 * 10**9, 5 * 10**9, NAT, 7 * 10**9]
     assert raw.attrs["unreadable_rows"] == 3
     notes = " | ".join(raw.attrs["notes"])
-    assert "3 of 8 rows are unreadable: lines 5, 10, 11" in notes
-    assert "2 gyro cells hold no number in rows that are readable otherwise: lines 4, 8" in notes
+    assert "3 of 8 rows are unreadable: lines 5 ('2,3'), 10, 11" in notes
+    places = "lines 4 ('****'), 8"
+    assert f"2 gyro cells hold no number in rows that are readable otherwise: {places}" in notes
 
 
 def test_number_in_an_unreadable_row_is_not_a_stamp(tmp_path: Path) -> None:
@@ -392,7 +393,7 @@ def test_axes_and_channels_without_a_number_are_named(tmp_path: Path, damage: st
     named = ["axis z", "channel temperature"] if not damage else []
     for name in named:
         assert f"no row holds a number for {name}" in text
-    assert ("lines 2, 3, 4" in text) == bool(damage)
+    assert ("lines 2 ('0,0,0,,'), 3, 4" in text) == bool(damage)
 
 
 def test_cells_without_a_number_are_counted_without_those_of_an_empty_axis(tmp_path: Path) -> None:
@@ -400,6 +401,22 @@ def test_cells_without_a_number_are_counted_without_those_of_an_empty_axis(tmp_p
     header = "time [s],gyro_x [deg/h],gyro_y [deg/h],gyro_z [deg/h]\n"
     (note,) = read_log(write(tmp_path, header + rows + "bad,1,2,\n")).attrs["notes"][-1:]
     assert note.endswith("1 gyro cells hold no number in rows that are readable otherwise")
+
+
+@pytest.mark.parametrize("ending", ["csv", "csv.gz"])
+def test_minus_signs_of_typography_are_read(tmp_path: Path, ending: str) -> None:
+    """.NET writes U+2212 in Norwegian, Swedish and Finnish."""
+    numbers = np.random.default_rng(0).normal(size=(300, 2)).round(4)
+    rows = "".join(f"{n / 50 - 3:.2f};{x:.4f};{y:.3e}\n" for n, (x, y) in enumerate(numbers))
+    head = "time [s];gyro_x [deg/h];gyro_y [deg/h]\n"
+    plain = read_log(write(tmp_path, head + rows.replace(".", ",")))
+    text = (head + rows.replace(".", ",").replace("-", "\N{MINUS SIGN}")).encode()
+    path = write(tmp_path, gzip.compress(text) if "gz" in ending else text, f"signs.{ending}")
+    raw = read_log(path)
+    np.testing.assert_array_equal(raw.rate, plain.rate)
+    np.testing.assert_array_equal(raw.time, plain.time)
+    assert len(raw.attrs["notes"]) == 1
+    assert scan_file(path).first == plain.time[0]
 
 
 def test_exponents_of_fortran_are_read(tmp_path: Path) -> None:
@@ -412,5 +429,5 @@ def test_exponents_of_fortran_are_read(tmp_path: Path) -> None:
 
 def test_the_first_of_many_unreadable_rows_is_quoted(tmp_path: Path) -> None:
     rows = "0,1\n" + "".join(f"{n},1.5*10^{n}\n" for n in range(1, 20))
-    with pytest.raises(FormatError, match=r"the first is line 3: '1,1\.5\*10\^1'; look at it"):
+    with pytest.raises(FormatError, match=r"the first is line 3: '1\.5\*10\^1'; look at it"):
         read_log(write(tmp_path, "time [s],gyro_x [deg/h]\n" + rows))
