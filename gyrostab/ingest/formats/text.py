@@ -95,6 +95,13 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
     for parsed, converted in map_in_order(parse, blocks):
         if dates is not None:
             _check_fractions(parsed, f"{path.name}: ", line, dates)
+        for row, cell, first in parsed.other_headers[:1]:
+            place = parsed.name_lines(line, [row])[0]
+            raise FormatError(
+                f"{path.name}: {place} is a header unlike the first one: {cell!r} in place of "
+                f"{first!r}; cut the file before {place}, so that each part has its own header, "
+                "and read the parts together as one log"
+            )
         quote = partial(parser.quote_fault, parsed)
         builder.add(converted, partial(parsed.name_lines, line), quote)
         line += parsed.lines

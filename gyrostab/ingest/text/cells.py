@@ -30,6 +30,8 @@ class ParsedBlock(NamedTuple):
     block: bytes
     starts: NDArray[np.int64]  # position of each row in the block
     lines: int  # number of lines, with comments and empty lines
+    #: Rows that are headers unlike the first one: row, a cell that differs, cell of the first one.
+    other_headers: list[tuple[int, str, str]]
 
     def name_lines(self, first: int, rows: Sequence[int]) -> list[str]:
         """Name rows by their lines; `first` is the number of the first line of the block."""
@@ -102,7 +104,15 @@ class BlockParser:
             stamps = integers_to_ns(stamps, self.counted, self.epoch)
         words = self._parse_cells(other_lines, values, stamps) if other_lines else 0
         columns = dict(zip(self.sources, values[:, :row], strict=True))
-        return ParsedBlock(columns, stamps, words, block, starts[:row], lines)
+        parsed = ParsedBlock(columns, stamps, words, block, starts[:row], lines, [])
+        rows = np.array(list(other_lines), dtype=np.int64)
+        is_void = np.isnan(values[:, rows]).all(axis=0)
+        if stamps is not None:
+            is_void &= stamps[rows] == NAT
+        for void_row in rows[is_void].tolist():
+            if change := self.layout.find_header_change(parsed.read_line(void_row)):
+                parsed.other_headers.append((void_row, *change))
+        return parsed
 
     def quote_fault(self, parsed: ParsedBlock, row: int) -> str:
         """Quote the first cell of a row that cannot be read, or the row if none is filled."""

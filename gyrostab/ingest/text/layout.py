@@ -7,7 +7,8 @@ import re
 from codecs import BOM_UTF8
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice, pairwise, takewhile
+from functools import cached_property
+from itertools import islice, pairwise, takewhile, zip_longest
 from pathlib import Path
 
 from gyrostab.errors import FormatError
@@ -56,6 +57,8 @@ class Layout:
     paired: int | None = None
     #: Units in a row under the header, by column.
     units: Mapping[int, str] = field(default_factory=dict)
+    #: Cells of the header row, and of the units under it, as they are written; empty without them.
+    header_rows: tuple[tuple[str, ...], ...] = ()
 
     @property
     def width(self) -> int:
@@ -65,6 +68,31 @@ class Layout:
     def split_row(self, line: str) -> list[str]:
         """Split a data row into cells."""
         return _join_pair(split_line(line, self.separator), self.paired)
+
+    @cached_property
+    def _names(self) -> set[str]:
+        return _bare_names(self.header_rows[0]) if self.header_rows else set()
+
+    def find_header_change(self, line: str) -> tuple[str, str] | None:
+        """Return a cell of a later header, or of units under it, that differs, and the first one.
+
+        None if all cells are as in the first header, or if the line is neither header nor units.
+        """
+        is_likely = 2 * sum(name in line.lower() for name in self._names) > len(self._names)
+        if not self.header_rows or not (is_likely or self.units):
+            return None
+        try:
+            cells = _header_cells(line, self.separator)
+        except csv.Error:
+            return None
+        header, *units = self.header_rows
+        if is_likely and 2 * len(_bare_names(cells) & self._names) > len(self._names):
+            pairs = zip_longest(cells, header, fillvalue="")
+        elif units and _find_units(cells, header):
+            pairs = zip_longest(cells, units[0], fillvalue="")
+        else:
+            return None
+        return next((pair for pair in pairs if pair[0] != pair[1]), None)
 
 
 def unit_of_duration(text: str) -> str | None:
@@ -112,8 +140,10 @@ def find_layout(
     header, separator, above, first = _find_header(path, lines, content)
     data = [index for index in content if index >= first]
     units = _find_units(split_line(lines[data[0]], separator), header) if header and data else {}
+    header_rows = [] if header is None else [tuple(header)]
     if units:
         first = data.pop(0) + 1
+        header_rows.append(tuple(split_line(lines[first - 1], separator)))
     offset = sum(len(line) for line in head.splitlines(keepends=True)[:first])
     if first == 0 and head.startswith(BOM_UTF8):
         offset = len(BOM_UTF8)
@@ -150,7 +180,7 @@ def find_layout(
     top = tuple(lines[:above]) if header is not None else ()
     return Layout(
         tuple(headers), separator, offset, first + 1, tuple(samples[:50]), comma, tuple(notes), top,
-        paired, units,
+        paired, units, tuple(header_rows),
     )  # fmt: skip
 
 
@@ -270,6 +300,11 @@ def _header_cells(line: str, separator: str) -> list[str]:
         if separator == BLANK
         else split_line(line, separator)
     )
+
+
+def _bare_names(cells: Sequence[str]) -> set[str]:
+    """Return the names of header cells without their units, in lower case."""
+    return {split_header(cell)[0].lower() for cell in cells} - {""}
 
 
 def _is_data(cells: list[str], *, comma: bool) -> bool:

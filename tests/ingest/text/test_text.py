@@ -403,6 +403,57 @@ def test_cells_without_a_number_are_counted_without_those_of_an_empty_axis(tmp_p
     assert note.endswith("1 gyro cells hold no number in rows that are readable otherwise")
 
 
+@pytest.mark.parametrize(
+    ("later", "change"),
+    [
+        (
+            "time [s],gyro_x [deg/s],gyro_y [deg/h]",
+            r"'gyro_x \[deg/s\]' in place of 'gyro_x \[°/h\]'",
+        ),
+        (
+            "time [s],gyro_y [deg/h],gyro_x [°/h]",
+            r"'gyro_y \[deg/h\]' in place of 'gyro_x \[°/h\]'",
+        ),
+        (
+            "time [s],gyro_x [°/h],gyro_y [deg/h],gyro_z [deg/h]",
+            r"'gyro_z \[deg/h\]' in place of ''",
+        ),
+        ("time [s],gyro_x [°/h],gyro_y [deg/h]", None),
+        ("time is lost,gyro_x,", None),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_a_later_header_that_differs_is_refused(
+    tmp_path: Path, later: str, change: str | None, encoding: str
+) -> None:
+    """A logger that was configured anew appends a header; the rows below it have other units."""
+    rows = [f"{n},{n % 7},{n % 5}\n" for n in range(600)]
+    text = "time [s],gyro_x [°/h],gyro_y [deg/h]\n" + "".join(
+        [*rows[:300], later + "\n", *rows[300:]]
+    )
+    path = write(tmp_path, text.encode(encoding))
+    if change is None:
+        raw = read_log(path)
+        assert (raw.sizes["row"], raw.attrs["unreadable_rows"]) == (601, 1)
+        return
+    with pytest.raises(FormatError, match=rf"log.csv: line 302 is a header .*: {change}; cut"):
+        read_log(path)
+
+
+@pytest.mark.parametrize(("unit", "is_refused"), [("deg/h", False), ("deg/s", True)])
+def test_later_units_under_a_header_are_compared(
+    tmp_path: Path, unit: str, is_refused: bool
+) -> None:
+    head = "time;gyro_x\ns;{}\n"
+    rows = "".join(f"{n};{n % 7}\n" for n in range(30))
+    path = write(tmp_path, head.format("deg/h") + rows + head.format(unit) + rows)
+    if not is_refused:
+        assert read_log(path).attrs["unreadable_rows"] == 2
+        return
+    with pytest.raises(FormatError, match=r"log.csv: line 34 is .* 'deg/s' in place of 'deg/h'"):
+        read_log(path)
+
+
 @pytest.mark.parametrize("ending", ["csv", "csv.gz"])
 def test_minus_signs_of_typography_are_read(tmp_path: Path, ending: str) -> None:
     """.NET writes U+2212 in Norwegian, Swedish and Finnish."""
