@@ -83,6 +83,7 @@ class Placement:
     def has_late_rows(self) -> bool:
         """Whether three consecutive rows were dropped, as happens after a pause."""
         rows = np.sort(self.events[np.isin(self.events[:, 0], (DUPLICATE, OUT_OF_ORDER)), 2])
+        rows = rows[self.samples_of(rows) < 0]
         return bool((rows[2:] - rows[:-2] == 2).any())
 
 

@@ -248,6 +248,22 @@ def test_late_row_in_its_place_leaves_no_gap():
     assert gap_table(log).cause.tolist() == ["out_of_order"]
 
 
+@pytest.mark.parametrize("lost", [0, 3])
+def test_packets_in_the_wrong_order_take_their_places(lost):
+    """Also if elsewhere a few rows repeat a stamp and are dropped."""
+    samples = np.arange(12_000)
+    for begin in range(1000, 10_000, 300):
+        samples[begin : begin + 20] = np.roll(samples[begin : begin + 20], 10)
+    samples = np.insert(samples, 11_000, samples[10_999 - lost : 10_999])
+    log = regularise(raw_log(stamps_of(samples, 50.0)))
+    truth = samples.copy()
+    truth[11_000 : 11_000 + lost] = -1
+    np.testing.assert_array_equal(log.rate.values[0], expected(truth))
+    table = gap_table(log)
+    assert table[table.cause == "out_of_order"].rows.sum() == 300 + lost
+    assert any("300 were put in their place" in note for note in log.attrs["notes"])
+
+
 def test_channels_on_time_and_slow_channels_on_their_own():
     n = 300
     stamps = np.concatenate([stamps_of(np.arange(n), 100.0), stamps_of(np.arange(n), 100.0)])
