@@ -169,13 +169,17 @@ def name_columns(
     presets: Mapping[int, str],
 ) -> list[Header]:
     """Name the columns by ``--map``, then by the preset, and drop those that either drops."""
-    keys_by_name = {key.strip().lower(): key for key in plan.options.map}
+    headers = list(distinct_columns(columns))
+    exact_keys = {key.strip(): key for key in plan.options.map}
+    names = {text for column in headers for text in (column.key, column.header, column.name)}
+    keys_by_name = {key.lower(): exact_keys[key] for key in exact_keys if key not in names}
     targets = {split_header(target)[0].lower() for target in plan.options.map.values()}
     are_axes_given = any(map(AXIS_PATTERN.match, targets))  # then the preset names none
     named: list[Header] = []
-    for column in distinct_columns(columns):
-        texts = (column.key.lower(), column.header.lower(), column.low)
-        key = next((keys_by_name[text] for text in texts if text in keys_by_name), None)
+    for column in headers:
+        texts = (column.key, column.header, column.name)
+        keys = (exact_keys.get(text, keys_by_name.get(text.lower())) for text in texts)
+        key = next(filter(None, keys), None)
         if key is not None:
             plan.used_map.add(key)
             target, target_unit = split_header(plan.options.map[key])

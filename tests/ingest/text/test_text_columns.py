@@ -372,6 +372,20 @@ def test_temperature_called_t_is_not_the_time(tmp_path: Path) -> None:
     assert ns(read_log(write(tmp_path, "t [s],gyro_x [deg/h]\n0,1\n1,2\n"))) == [0, 10**9]
 
 
+@pytest.mark.parametrize("units", [True, False])
+def test_names_that_differ_in_case_only_are_mapped_as_written(tmp_path: Path, units: bool) -> None:
+    """Time and temperature are often called t and T."""
+    header = "t [s],gyro_x [deg/h],T [degC]" if units else "t,gyro_x,T"
+    unit = {} if units else {"time": "s", "gyro": "deg/h", "temperature": "degC"}
+    path = write(tmp_path, f"{header}\n0,1,20\n1,2,21\n")
+    for names in ({"t": "time", "T": "temperature"}, {"T": "temperature"}):
+        raw = read_log(path, map=names, unit=unit)
+        assert raw.temperature.values.tolist() == [20, 21]
+        assert ns(raw) == [0, 10**9]
+    alone = write(tmp_path, "t [s],gyro_x [deg/h]\n0,1\n1,2\n")
+    assert ns(read_log(alone, map={"T": "time"})) == [0, 10**9]
+
+
 # --- statements of the page on formats
 
 
