@@ -100,7 +100,6 @@ _add_unit("rate", 1.0, "dph")
 _add_unit("rate", HOUR, "dps")
 _add_unit("rate", 1e-3 * HOUR, "mdps")
 _add_unit("rate", 6.0 * HOUR, "rpm", "r/min")
-_add_unit("rate", 360.0 * HOUR, "r/s")
 _add_unit("temperature", 1.0, "degC", "C", "celsius", "deg celsius")
 _add_unit("temperature", 1.0, "K", "kelvin", "degK", offset=-273.15)
 _add_unit(
@@ -166,6 +165,8 @@ _LISTED = {
     "angle": "deg, arcsec, rad, mrad, urad",
     "acceleration": "g, mg, m/s^2",
 }
+#: Spellings of rates, as `_fold_spelling` returns them, that programs use for different units.
+_AMBIGUOUS = ("r/s", "rps")
 _TOKEN = re.compile(r'\s*(/|per\b)?\s*\(?\s*([A-Za-zµμ°"_]+)([+-]?\d)?\s*\)?', re.IGNORECASE)
 #: A factor in front of a unit, not followed by further digits of its number.
 _NUMBER = re.compile(r"^([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)(?![\d.])\s*\*?\s*(.+)$")
@@ -203,7 +204,7 @@ def parse_unit(text: str, quantity: str | None = None) -> Unit:
     Raises
     ------
     UnitError
-        When the string is not known; the message lists what is.
+        When the string is not known, or ambiguous; the message lists what is known.
 
     Examples
     --------
@@ -226,6 +227,10 @@ def parse_unit(text: str, quantity: str | None = None) -> Unit:
     if definition is not None:
         return Unit(text, *definition)
     match = _NUMBER.match(_normalize_text(text))
+    if _fold_spelling(match.group(2) if match else text) in _AMBIGUOUS:
+        raise UnitError(
+            f"unit {text!r} may be revolutions or radians per second; write rev/s or rad/s"
+        )
     definition = _find_unit(match.group(2), quantity) if match else None
     if match and definition is not None:
         kind, factor, offset = definition

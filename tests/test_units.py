@@ -110,6 +110,14 @@ def test_what_is_not_a_unit_is_refused_with_what_is(text):
         parse_unit("quux")
 
 
+@pytest.mark.parametrize("text", ["r/s", "R/S", "r s^-1", "rps", "0.01 r/s"])
+def test_revolutions_and_radians_are_not_confused(text):
+    for quantity in (None, "rate", "rotation_rate"):
+        with pytest.raises(UnitError, match="write rev/s or rad/s"):
+            parse_unit(text, quantity)
+    assert parse_unit("r/min").factor == 6 * 3600
+
+
 @pytest.mark.parametrize("text", ["21", "2.1", "1.1", "1e-11", "0.1", "1.2.3 deg"])
 def test_a_number_is_not_a_factor_of_its_last_digit(text):
     with pytest.raises(UnitError, match="not known"):

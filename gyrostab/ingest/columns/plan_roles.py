@@ -152,7 +152,7 @@ def _plan_axis(plan: Plan, column: Header) -> str | None:
         unit = parse_unit(text, quantity)
     except UnitError as error:
         problem = f"column {column.header!r}: {error}"
-        if "factor" not in str(error):
+        if "is not known" in str(error):
             problem = (
                 f"column {column.header!r}: unit {text!r} is not known; known are "
                 f"{known_units('rate')}; give it with --unit {stem}={example}, or with a factor "

@@ -241,6 +241,12 @@ def test_keys_of_columns_are_unique() -> None:
             r"'furlong' is not known.*--unit gyro=deg/s",
         ),
         (
+            "time [s],gyro_x [r/s]\n0,1\n1,2\n",
+            {},
+            UnitError,
+            r"'gyro_x \[r/s\]': unit 'r/s' may be revolutions or radians .*write rev/s or rad/s",
+        ),
+        (
             "time [s],gyro_x [degC]\n0,1\n1,2\n",
             {},
             UnitError,
