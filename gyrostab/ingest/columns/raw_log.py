@@ -25,7 +25,7 @@ MAX_NAMED_PLACES = 10
 #: Largest share of unreadable rows; a file with more is refused.
 MAX_UNREADABLE_SHARE = 0.5
 
-#: Rows at the beginning in which a code for missing values is searched.
+#: Rows at the beginning, or around an extreme, in which a code for missing values is searched.
 _CODE_ROWS = 2**18
 #: A code repeats, is farther from the other values than their range times this number, and the
 #: latter have at least so many different values, unlike the states of a switch.
@@ -79,6 +79,10 @@ class RawLogBuilder:
         self.low, self.high = np.iinfo(np.int64).max, NAT
         unit = None if self.time is None else self.time.time_unit
         self.clock = TurningClock() if unit is not None and unit.epoch is None else None
+        #: Column number -> lowest and highest value in the inner unit, each with its row.
+        self.extremes = {
+            column.source: [(np.inf, 0), (-np.inf, 0)] for column in [*self.gyro, *self.channels]
+        }
         #: Column number -> range, with zero, of whole numbers; None for others.
         self.whole: dict[int, tuple[float, float] | None] = {
             column.source: (0.0, 0.0) for column in [*self.gyro, *self.channels]
@@ -128,6 +132,7 @@ class RawLogBuilder:
             if span is not None and missing < converted.rows:
                 self.whole[source] = (min(span[0], low), max(span[1], high)) if is_whole else None
         first = self.buffers.rows
+        self._find_extremes(converted, first)
         locate = locate or (lambda rows: [f"row {first + row}" for row in rows])
         self.bad_rows.add(converted.bad_rows, locate, quote)
         self.cell_rows.add(converted.cell_rows, locate, quote)
@@ -142,6 +147,21 @@ class RawLogBuilder:
             self.low = int(good.min(initial=self.low))
             self.high = int(good.max(initial=self.high))
         self.buffers.add(block)
+
+    def _find_extremes(self, converted: ConvertedBlock, first: int) -> None:
+        """Note the rows of extremes beyond those of earlier blocks."""
+        for column in [*self.gyro, *self.channels]:
+            missing, *span, _ = converted.ranges[column.source]
+            cells = converted.values[column.source]
+            if missing == cells.size:
+                continue
+            low, high = sorted(end * column.factor + column.offset for end in span)
+            lowest, highest = self.extremes[column.source]
+            if low < lowest[0]:
+                lowest = low, first + int(np.nanargmin(cells))
+            if high > highest[0]:
+                highest = high, first + int(np.nanargmax(cells))
+            self.extremes[column.source] = [lowest, highest]
 
     def _packing_of(self, columns: Sequence[Column]) -> dict[str, Any]:
         """Return the encoding of columns of whole numbers with one factor; empty for others."""
@@ -165,7 +185,7 @@ class RawLogBuilder:
         notes = [
             *self.plan.notes,
             *notes,
-            *describe_codes([*self.gyro, *self.channels], columns),
+            *describe_codes([*self.gyro, *self.channels], columns, self.extremes),
             *self._describe_faults(rows),
             *(self.clock.describe() if self.clock is not None else ()),
         ]
@@ -338,48 +358,74 @@ class _Places:
         return f"{kind}{'s' * (len(names) > 1)} {', '.join(numbers)}{others}"
 
 
-def describe_codes(columns: Sequence[Column], values: Mapping[int, Any]) -> list[str]:
+def describe_codes(
+    columns: Sequence[Column],
+    values: Mapping[int, Any],
+    extremes: Mapping[int, Sequence[tuple[float, int]]],
+) -> list[str]:
     """Return notes on codes for missing values.
 
-    They repeat far outside all other values, or are common codes and the only value.
+    They repeat far outside all other values, or are common codes and the only value. They are
+    searched in the first rows, and around the `extremes` (value, row) that are far outside those.
     """
     notes = []
     for column in columns:
-        head = np.asarray(read_slice(values[column.source], 0, _CODE_ROWS), dtype=np.float64)
-        readings = head[np.isfinite(head)]
-        code = _find_code(readings)
-        only = code is None and len(readings) and readings.min() == readings.max()
-        value = float(readings[0]) if only else code
-        if value is None:
+        common = [code * column.factor + column.offset for code in _COMMON_CODES]
+        begin, rows = 0, _read_window(values[column.source], 0)
+        readings = rows[np.isfinite(rows)]
+        code = _find_code(readings, common)
+        for value, row in extremes[column.source]:
+            if code is None and row >= _CODE_ROWS and _is_far(value, readings):
+                begin = row - _CODE_ROWS // 2
+                rows = _read_window(values[column.source], begin)
+                readings = rows[np.isfinite(rows)]
+                code = _find_code(readings, common)
+        if code is None:
             continue
-        written = (value - column.offset) / column.factor
-        is_common = bool(np.isclose(written, _COMMON_CODES, rtol=1e-9).any())
-        if only and not is_common:
-            continue
+        count = int((readings == code).sum())
+        is_common = _is_common(code, common)
+        place = f"{len(rows)} rows from row {begin} on" if begin else f"the first {len(rows)} rows"
         notes.append(
-            f"{column.header!r} is {written:.10g} in {int((head == value).sum())} of the first "
-            f"{len(head)} rows{'' if only else ', far outside all other values'}; "
+            f"{column.header!r} is {(code - column.offset) / column.factor:.10g} in {count} of "
+            f"{place}{', far outside all other values' if count < len(readings) else ''}; "
             f"{'it is a common' if is_common else 'if that is a'} code for a missing value"
             f"{':' if is_common else ','} replace it by nan before the log is read"
         )
     return notes
 
 
-def _find_code(values: NDArray[np.float64]) -> float | None:
+def _read_window(values: Any, begin: int) -> NDArray[np.float64]:
+    return np.asarray(read_slice(values, begin, begin + _CODE_ROWS), dtype=np.float64)
+
+
+def _is_far(value: float, readings: NDArray[np.float64]) -> bool:
+    """Return whether a value is far outside others, in terms of their range."""
+    low, high = readings.min(initial=np.inf), readings.max(initial=-np.inf)
+    return bool(max(low - value, value - high) > _MIN_CODE_DISTANCE * (high - low))
+
+
+def _is_common(value: float, common: Sequence[float]) -> bool:
+    return bool(np.isclose(value, common, rtol=1e-9).any())
+
+
+def _find_code(values: NDArray[np.float64], common: Sequence[float]) -> float | None:
     """Return the lowest or highest value if it repeats far outside all others; zero is a reading.
+
+    A value that is one of the `common` codes may be the only one, or the others may be few.
 
     Examples
     --------
-    >>> _find_code(np.r_[np.arange(100.0), [-999.25] * 3]), _find_code(np.arange(100.0))
+    >>> _find_code(np.r_[np.arange(100.0), [-999.25] * 3], []), _find_code(np.arange(100.0), [])
     (-999.25, None)
+    >>> _find_code(np.r_[[20.0, 21.0] * 9, [-999.25] * 3], [-999.25])
+    -999.25
     """
     for code in (values.min(initial=np.inf), values.max(initial=-np.inf)):
-        others = values[values != code]
+        others, is_common = values[values != code], _is_common(code, common)
+        if is_common and values.size and not others.size:
+            return float(code)
         if code == 0 or not _MIN_CODE_REPEATS <= len(values) - len(others) < len(others):
             continue
-        low, high = others.min(), others.max()
-        if max(low - code, code - high) > _MIN_CODE_DISTANCE * (high - low) and (
-            len(np.unique(others)) >= _MIN_READINGS
-        ):
+        if _is_far(code, others) and (is_common or len(np.unique(others)) >= _MIN_READINGS):
             return float(code)
     return None

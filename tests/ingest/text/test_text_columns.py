@@ -479,3 +479,39 @@ def test_a_value_that_repeats_far_outside_all_others_is_noted(
     notes = [note for note in read_log(path).attrs["notes"] if "code for a missing" in note]
     assert len(notes) == is_noted
     assert all(f"'gyro_x [deg/s]' is {code:g} in {repeats} of the first" in note for note in notes)
+
+
+@pytest.mark.parametrize("block_bytes", [2**16, 2**22])
+@pytest.mark.parametrize(("first", "step"), [(2500, 50), (2990, 1)])
+def test_a_code_that_begins_late_is_noted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int, first: int, step: int
+) -> None:
+    monkeypatch.setattr("gyrostab.ingest.columns.raw_log._CODE_ROWS", 1000)
+    monkeypatch.setattr("gyrostab.ingest.formats.text.BLOCK_BYTES", block_bytes // 32)
+    gyro = np.random.default_rng(1).standard_normal((2, 3000)).round(4)
+    gyro[1, first::step] = -999.25
+    table = pd.DataFrame({
+        "time [s]": np.arange(3000) / 10.0, "gyro_x [deg/s]": gyro[0], "gyro_y [deg/s]": gyro[1],
+    })  # fmt: skip
+    table.to_csv(tmp_path / "log.csv", index=False)
+    notes = [note for note in read_log(tmp_path / "log.csv").attrs["notes"] if "code" in note]
+    assert len(notes) == 1
+    assert (
+        f"'gyro_y [deg/s]' is -999.25 in 10 of {3500 - first} rows from row {first - 500} on"
+        in notes[0]
+    )
+
+
+def test_a_common_code_among_few_readings_is_noted(tmp_path: Path) -> None:
+    """A coarse temperature has few different values; a switch has two, and no common code."""
+    random = np.random.default_rng(1)
+    temperature = 20.0 + random.integers(0, 10, 3000)
+    temperature[random.choice(3000, 150, replace=False)] = -999.25
+    table = pd.DataFrame({
+        "time [s]": np.arange(3000) / 10.0, "gyro_x [deg/s]": random.standard_normal(3000),
+        "temperature [degC]": temperature, "state [1]": np.where(np.arange(3000) % 9, 0, 5),
+    })  # fmt: skip
+    table.to_csv(tmp_path / "log.csv", index=False)
+    notes = [note for note in read_log(tmp_path / "log.csv").attrs["notes"] if "code" in note]
+    assert len(notes) == 1
+    assert "'temperature [degC]' is -999.25 in 150 of the first 3000 rows, far" in notes[0]
