@@ -246,6 +246,26 @@ def parse_unit(text: str, quantity: str | None = None) -> Unit:
     )
 
 
+def find_conversion(text: str, target: str) -> tuple[float, float] | None:
+    """Return factor and offset from one unit to another; None if they do not convert.
+
+    Examples
+    --------
+    >>> find_conversion("V", "mV"), find_conversion("degC", "V"), find_conversion("l/min", "l/min")
+    ((1000.0, 0.0), None, (1.0, 0.0))
+    """
+    if text == target:
+        return 1.0, 0.0
+    try:
+        units = parse_unit(text), parse_unit(target)
+    except UnitError:
+        return None
+    if units[0].quantity != units[1].quantity:
+        return None
+    factor = units[1].factor
+    return units[0].factor / factor, (units[0].offset - units[1].offset) / factor
+
+
 def _parse_base(name: str) -> tuple[str, float, float] | None:
     """Return dimension, numerator and denominator of a name with or without a prefix.
 

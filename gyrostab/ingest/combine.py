@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
 from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Spool
 from gyrostab.ingest.columns.stamps import CLOCK_PERIODS, NAT, read_stamps, typical_step
-from gyrostab.ingest.concat.core import absence_notes, check_units, merge_notes
+from gyrostab.ingest.concat.core import absence_notes, merge_notes, unify_units
 from gyrostab.ingest.concat.grid import group_axes, split_axes
 from gyrostab.ingest.concat.place import COMPARED_SAMPLES, match_ends
 from gyrostab.schema import SIGNAL_UNITS
@@ -26,9 +26,15 @@ from gyrostab.store.lazy import (
     stack_rows,
 )
 from gyrostab.store.write import common_packing
+from gyrostab.units import find_conversion
 from gyrostab.wording import list_some
 
 _BLOCK_ROWS, _FIRST_ROWS = 2**20, 2**12
+#: Advice where units of a channel do not convert to each other.
+_ADVICE = (
+    'if a header is wrong, give the unit of all with --map "{0}={0} [UNIT]", otherwise drop the '
+    "channel with --map {0}=-"
+)
 
 
 def memory_bytes(part: xr.Dataset) -> int:
@@ -219,11 +225,12 @@ def _concatenate_parts(
         str(name) for part in parts for name in part.data_vars if name != signal
     ):
         holders = [(part.attrs["source_files"][0], part) for part in parts if channel in part]
-        advice = f"give one with --unit {channel}=UNIT or drop it with --map {channel}=-"
-        check_units(holders, channel, advice)
-        columns = [part[channel].data if channel in part else None for part in parts]
-        units = holders[0][1][channel].attrs["units"]
-        packing = common_packing(part[channel].encoding for _, part in holders)
+        unified = iter(unify_units(holders, channel, _ADVICE.format(channel)))
+        converted = [next(unified)[channel] if channel in part else None for part in parts]
+        held = [column for column in converted if column is not None]
+        columns = [None if column is None else column.data for column in converted]
+        units = held[0].attrs["units"]
+        packing = common_packing(column.encoding for column in held)
         data[channel] = ("row", join(f"channel {channel}", columns), {"units": units}, packing)
     joined = xr.Dataset(data, coords=coords, attrs=dict(parts[0].attrs))
     joined.attrs.update(
@@ -277,12 +284,17 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
             pieces.setdefault(channel, []).append((stamps, values, units))
     for channel, parts in pieces.items():
         stamps_of_files, values_of_files, units = zip(*parts, strict=True)
-        if len(set(units)) > 1:
+        conversions = [find_conversion(unit, units[0]) for unit in units]
+        if None in conversions:
             raise UnitError(
-                f"channel {channel!r} has different units in {list_some(files)}; give one with "
-                f"--unit {channel}=UNIT"
+                f"channel {channel!r} has different units in {list_some(files)}: "
+                f"{list_some(sorted(set(units)))}; {_ADVICE.format(channel)}"
             )
-        stamps, values = np.concatenate(stamps_of_files), np.concatenate(values_of_files)
+        numbers = [
+            array * conversion[0] + conversion[1] if conversion else array
+            for array, conversion in zip(values_of_files, conversions, strict=True)
+        ]
+        stamps, values = np.concatenate(stamps_of_files), np.concatenate(numbers)
         order, dim = np.argsort(stamps, kind="stable"), f"time_{channel}"
         log = log.assign_coords({dim: (dim, stamps[order])}).assign(
             {channel: (dim, values[order], {"units": units[0]})}

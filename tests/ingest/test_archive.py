@@ -332,11 +332,13 @@ def test_axes_and_channels_that_some_logs_lack_are_missing_there() -> None:
     np.testing.assert_array_equal(joined.vibration, np.where(np.arange(1000) < 500, 1.0, np.nan))
     assert "axis y is not in a.nc" in said(joined)
     assert "channel vibration is not in b.nc" in said(joined)
-    wrong = second.assign(vibration=("time", np.ones(600), {"units": "m s-2"}))
+    wrong = second.assign(vibration=("time", np.ones(600), {"units": "m s-1"}))
     with pytest.raises(
-        UnitError, match=r"'vibration' has different units: 'm s-2' in b.nc, 'g' in a.nc"
+        UnitError, match=r"'vibration' has different units: 'm s-1' in b.nc, 'g' in a.nc"
     ):
         join(first, wrong)
+    other = wrong.assign(vibration=("time", np.full(600, 9.80665), {"units": "m s-2"}))
+    assert np.ptp(join(first, other).vibration.values) < 1e-12
 
 
 def with_temperature(log: xr.Dataset, seconds: np.ndarray) -> xr.Dataset:

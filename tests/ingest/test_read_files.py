@@ -212,8 +212,31 @@ def test_kinds_and_channel_units_must_agree(tmp_path: Path) -> None:
         match=r"rate.csv holds a gyro signal of kind 'rate', angle.csv of kind 'increment'",
     ):
         read_log([rate, angle], kind="rate")
-    with pytest.raises(UnitError, match=r"channel 'flow' has different units"):
+    with pytest.raises(
+        UnitError, match=r"'flow' has different units: 'm3/h' in other.csv.*--map \"flow="
+    ):
         read_log([rate, other])
+
+
+def test_channels_in_other_units_are_converted_to_those_of_the_first_file(tmp_path: Path) -> None:
+    """Without a name that gyrostab knows, a channel keeps the unit of its header."""
+    paths = [
+        write(
+            tmp_path / f"{name}.csv",
+            f"time [s],gyro_x [deg/h],board temp [{degree}],bias [{volt}]\n"
+            f"{start},1,{temperature},{bias}\n{start + 1},2,{temperature},{bias}\n",
+        )
+        for name, start, degree, temperature, volt, bias in (
+            ("a", 2, "degF", 77, "mV", 1500), ("b", 0, "degC", 25, "V", 1.5),
+            ("c", 4, "degC", 25, "mV", 1500),
+        )
+    ]  # fmt: skip
+    together = read_log(paths)
+    gyro = write(tmp_path / "gyro.csv", "time [s],gyro_x [deg/h]\n0,1\n1,2\n2,3\n3,4\n")
+    for log in (together, read_log(gyro, channel=[paths[1], *paths[::2]])):
+        np.testing.assert_allclose(log["board_temp"], [25.0] * 6)
+        np.testing.assert_allclose(log["bias"], [1.5] * 6)
+        assert (log["board_temp"].units, log["bias"].units) == ("degC", "V")
 
 
 def test_map_that_matches_one_of_the_files_is_accepted(pair: list[Path]) -> None:

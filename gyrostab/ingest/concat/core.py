@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,13 @@ from gyrostab.ingest.concat.place import place_logs
 from gyrostab.ingest.gap_table import gap_variables, name_lost
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name, texts
-from gyrostab.store.lazy import concatenate_columns, take_samples
+from gyrostab.store.lazy import concatenate_columns, convert_lazy, take_samples
 from gyrostab.store.private import close_function
 from gyrostab.store.write import common_packing
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import grid_index, grid_times, time_coordinate
 from gyrostab.time.stamps import extend_history, format_stamp, to_nanoseconds
+from gyrostab.units import find_conversion
 from gyrostab.wording import list_some
 
 #: Smallest share of a log without an axis of other logs that is noted; recorders are started one
@@ -75,7 +77,7 @@ def concatenate_logs(
         When the sampling rates differ by more than 100 parts per million, or the common grid is
         much longer than the logs together.
     UnitError
-        When the logs have different kinds of signal, or a channel has different units.
+        When the logs have different kinds of signal, or units of a channel do not convert.
 
     Examples
     --------
@@ -295,7 +297,13 @@ def concatenate_channels(
     for name in dict.fromkeys(name for piece in pieces for name in log_channels(piece.source.log)):
         holders = [piece for piece in pieces if name in piece.source.log]
         advice = f"ingest one of them again with --unit {name}=UNIT or --map {name}=-"
-        check_units([(piece.source.name, piece.source.log) for piece in holders], name, advice)
+        logs = unify_units(
+            [(piece.source.name, piece.source.log) for piece in holders], name, advice
+        )
+        holders = [
+            replace(piece, source=replace(piece.source, log=log))
+            for piece, log in zip(holders, logs, strict=True)
+        ]
         attributes = dict(holders[0].source.log[name].attrs)
         if all(piece.source.log.variables[name].dims != ("time",) for piece in holders):
             stamps, values = _own_time(holders, name, start, rate)
@@ -307,12 +315,36 @@ def concatenate_channels(
     return variables, coordinates
 
 
-def check_units(logs: Sequence[tuple[str, xr.Dataset]], name: str, advice: str) -> None:
-    """Refuse logs, with their file names, in which a channel has different units."""
+def unify_units(logs: Sequence[tuple[str, xr.Dataset]], name: str, advice: str) -> list[xr.Dataset]:
+    """Return logs, given with their file names, with a channel in the unit that the first one has.
+
+    `UnitError` if units do not convert.
+    """
     units = {str(log.variables[name].attrs.get("units", "1")): file for file, log in reversed(logs)}
-    if len(units) > 1:
+    target = str(logs[0][1].variables[name].attrs.get("units", "1"))
+    conversions = {unit: find_conversion(unit, target) for unit in units}
+    if None in conversions.values():
         listed = ", ".join(f"{unit!r} in {file}" for unit, file in units.items())
         raise UnitError(f"channel {name!r} has different units: {listed}; {advice}")
+    unified = []
+    for _, log in logs:
+        variable = log.variables[name]
+        factor, offset = conversions[str(variable.attrs.get("units", "1"))] or (1.0, 0.0)
+        if (factor, offset) != (1.0, 0.0):
+            convert = partial(_scale_values, factor=factor, offset=offset)
+            is_lazy = hasattr(variable.data, "dask")
+            data = (
+                convert_lazy(variable.data, convert, np.float64)
+                if is_lazy
+                else convert(variable.data)
+            )
+            log = log.assign({name: (variable.dims, data, variable.attrs | {"units": target})})
+        unified.append(log)
+    return unified
+
+
+def _scale_values(values: NDArray[Any], factor: float, offset: float) -> NDArray[np.float64]:
+    return np.asarray(values * factor + offset, dtype=np.float64)
 
 
 def _on_time(piece: PlacedLog, name: str, start: int, rate: float) -> PlacedArray:
