@@ -13,11 +13,12 @@ from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, file_of
 from gyrostab.store.lazy import RowSource, make_dask, read_into, read_slice
 from gyrostab.store.write import pack_counts
 
-#: A circle [degree], and the counts of counters of 16, 24 and 32 bits.
-_CIRCLE, _COUNTERS = 360.0, (2**16, 2**24, 2**32)
+#: A circle [degree], and the counts of counters of 8 to 32 bits.
+_CIRCLE, _COUNTERS = 360.0, tuple(2**bits for bits in range(8, 33))
 #: Longest step, in usual steps, from the angle at which a wrapped angle or a counter begins again.
 _REACH = 5.0
-#: Shortest period of a counter [usual steps]: noise of the angle has no such steps.
+#: Shortest period of a counter [usual steps]: noise of the angle has no such steps. A range of that
+#: size is also needed for a step over more than half of it to be a jump.
 _MIN_PERIOD = 16.0
 #: Shortest step that is a jump [usual steps], and the longest time between two rows over which a
 #: counter that was set to zero is continued [usual times].
@@ -76,20 +77,28 @@ class TurningAngle:
         period = min((p for p in [*counters, _CIRCLE] if span <= p * (1 + 1e-9)), default=np.inf)
         forward = pauses[pauses > 0]
         waits = pauses / float(np.median(forward)) if forward.size else np.ones(pauses.size)
-        reach = _REACH * usual * np.maximum(waits, 1.0)
+        times = np.maximum(waits, 1.0)
+        reach = _REACH * usual * times
         is_turn = (sizes > period / 2) & (np.abs(sizes - period) <= np.minimum(reach, period / 2))
-        is_jump = (sizes > _MIN_JUMP / _REACH * reach) & ~is_turn
+        if period != _CIRCLE and is_turn.any():
+            # steps less the motion before them are the period: 1000 counts are no 10 bits
+            periods = np.abs(steps - np.roll(steps / times, 1) * times)[is_turn]
+            error = abs(float(np.median(periods)) - period)
+            is_turn &= error <= _REACH * usual / np.sqrt(periods.size)
+        is_large = sizes > _MIN_JUMP / _REACH * reach
+        is_over_half = (2 * sizes > span) & (span > _MIN_PERIOD / _REACH * reach)
+        is_jump = (is_large | is_over_half) & ~is_turn
         # motion and a wrong value have several such steps in succession
         is_quiet = sizes <= reach
         is_jump &= np.append(True, is_quiet[:-1]) & np.append(is_quiet[1:], True)
-        is_reset = is_jump & (np.abs(written) <= reach) & (waits <= _MAX_PAUSE)
+        is_reset = is_jump & is_large & (np.abs(written) <= reach) & (waits <= _MAX_PAUSE)
         is_reset &= np.cumsum(is_jump & ~is_reset) == 0  # otherwise it may be the way back
         if self.jumps:
             is_reset[:] = False
         added = np.where(
             is_reset, written - steps, -np.sign(steps) * (period if is_turn.any() else 0.0)
         )
-        motion = (sizes / np.maximum(waits, 1.0))[(sizes > 0) & ~is_turn]
+        motion = (sizes / times)[(sizes > 0) & ~is_turn]
         self.usual = max(self.usual, float(np.quantile(motion, 0.9)) if motion.size else 0.0)
         if is_turn.any():
             self.period = period
@@ -129,7 +138,7 @@ def _pack_continued(encoding: dict[Any, Any], turns: list[TurningAngle]) -> dict
 def continue_angles(raw: xr.Dataset) -> tuple[xr.Dataset, list[str], float]:
     """Continue the cumulative angles of a raw log where they begin again.
 
-    An angle that wraps around (360 degree) or a counter of 16, 24 or 32 bits that is full gets its
+    An angle that wraps around (360 degree) or a counter of 8 to 32 bits that is full gets its
     period, and a counter that was set to zero the angle that it had.
 
     Returns the raw log, notes, and the steps between samples over which the number of turns is

@@ -74,7 +74,8 @@ def test_unknown_turns_in_a_pause_are_missing_rates(tmp_path, monkeypatch, pause
 
 
 @pytest.mark.parametrize(
-    ("bits", "low"), [(16, 0), (16, -(2**15)), (24, 0), (32, -(2**31)), (32, 0)]
+    ("bits", "low"),
+    [(12, 0), (14, 0), (15, 0), (16, 0), (16, -(2**15)), (24, 0), (32, -(2**31)), (32, 0)],
 )
 def test_counter_that_is_full_is_continued(tmp_path, bits, low):
     counts = np.rint(make_angle(15 / 3600) / 0.01 * 3600)
@@ -117,6 +118,26 @@ def test_angles_that_do_not_begin_again_are_kept(tmp_path, zero):
     assert not any("is continued" in note for note in log.attrs["notes"])
     (note,) = [note for note in log.attrs["notes"] if "jumps" in note]
     assert note.endswith("1 place, first row 9000")
+
+
+@pytest.mark.parametrize("block", [2**12, 2**20])
+@pytest.mark.parametrize(
+    ("period", "unit"),
+    [(80.0, "arcsec"), (150.0, "arcsec"), (64.0, "0.001 arcsec")],  # 64000 counts are not 16 bits
+)
+def test_an_angle_that_wraps_at_an_unknown_angle_has_a_note(
+    tmp_path, monkeypatch, period, unit, block
+):
+    monkeypatch.setattr("gyrostab.ingest.grid.angles.BLOCK_ROWS", block)
+    seconds = (make_angle(120 / 3600) * 3600 + period / 2) % period
+    is_counted = unit != "arcsec"
+    written, digits = (seconds * 1000, 0) if is_counted else (seconds, 9)
+    log, read = read_angle(tmp_path, written, unit, digits=digits)
+    np.testing.assert_allclose(read * 3600, seconds, atol=1e-3)
+    (note,) = [note for note in log.attrs["notes"] if "of axis x" in note]
+    falls = np.flatnonzero(np.diff(seconds) < -period / 2) + 1
+    assert "jumps; variances over these rows are wrong" in note
+    assert f"first row {falls[0]}" in note
 
 
 def test_noise_of_fine_counts_is_no_full_counter(tmp_path):
