@@ -18,6 +18,7 @@ NO_STAMP = np.iinfo(np.int64).min
 #: Rows that `place` may look ahead; hand it that many more than it is to place.
 LOOK_AHEAD = 64
 _ORDER = 16  # rows within which an out-of-order row is followed by one past the latest stamp
+_EXCHANGED = 0.25  # of the stamp of an exchanged row from its sample: half of what places a row
 
 # what happened to a row, numbered as in schema.GAP_CAUSES
 _ON_TIME, _BY_COUNT, DUPLICATE, OUT_OF_ORDER, STEP, RESTART = 0, 1, 2, 3, 5, 6
@@ -162,6 +163,18 @@ def _fits_counting(stamps, j, expected, period, state):  # type: ignore[no-untyp
 
 
 @njit(**INNER)
+def _has_late_row(stamps, j, expected, period, state):  # type: ignore[no-untyped-def]
+    """Check whether a row soon after row j has the stamp of the sample that is due at row j."""
+    zero = state[_GRID0] - state[_PHASE] * _UNIT
+    for m in range(j + 1, min(len(stamps), j + 1 + _ORDER)):
+        if stamps[m] != NO_STAMP:
+            position = zero + (stamps[m] - state[_STAMP0]) / period
+            if abs(position - expected) <= _EXCHANGED:
+                return True
+    return False
+
+
+@njit(**INNER)
 def _stays_behind(stamps, j, n, latest):  # type: ignore[no-untyped-def]
     """Check whether the stamps after row j stay behind the latest one: the clock was set back."""
     count = 0
@@ -231,7 +244,10 @@ def _judge_ahead(stamps, j, position, period, max_gap, state):  # type: ignore[n
     # one, both are the same
     apart = j + 1 < len(stamps) and stamps[j + 1] > stamps[j] + 0.05 * period
     if (apart or not soon) and _fits_counting(stamps, j, expected, period, state):
-        return _BY_COUNT, expected
+        # the stamp of a row that was exchanged with a later one is right
+        is_near = position - expected <= _ORDER + 0.5
+        if not (is_near and _has_late_row(stamps, j, expected, period, state)):
+            return _BY_COUNT, expected
     if (stamps[j] - state[_LATEST]) / period > max_gap:
         return STEP, expected + 1
     return _ON_TIME, np.int64(np.rint(position))

@@ -77,6 +77,19 @@ def test_one_damaged_stamp_does_not_move_its_row():
     assert place([500, 501, 502, 3, 504, 505, 506])[0] == list(range(7))
 
 
+@pytest.mark.parametrize("pieces", [[], [21], [25]])
+@pytest.mark.parametrize("apart", [1, 2, 3, 5, 16])
+def test_two_exchanged_rows_take_their_samples(apart, pieces):
+    samples = np.arange(60)
+    samples[[20, 20 + apart]] = samples[[20 + apart, 20]]
+    placed, events = place(samples, pieces=pieces)
+    assert placed == samples.tolist()
+    assert events[:, 0].tolist() == [OUT_OF_ORDER] * apart
+    if apart > 1:  # a stray stamp alone does not move its row
+        samples[20 + apart] = 20 + apart
+        assert place(samples)[0] == list(range(60))
+
+
 def test_one_late_stamp_does_not_move_its_row():
     assert place([0, 1, 2, 3.9, 4, 5, 6, 7])[0] == list(range(8))
 
