@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gyrostab.ingest.columns.headers import TIME_PATTERN, is_time_unit, is_unit, is_unit_of
-from gyrostab.ingest.columns.stamps import parse_time_unit
+from gyrostab.ingest.columns.stamps import DATENUM, parse_time_unit
 from gyrostab.ingest.inspect import ColumnInspection, FileInspection
 from gyrostab.time.grid import MAX_RATE_HZ
 from gyrostab.units import HOUR, parse_unit
@@ -47,8 +47,8 @@ _TIME_UNIT_PATTERNS = (
 _UNITS = ("s", "ms", "us", "ns")
 #: Unix time between 2001 and 2033 is 1 to 2 of these [s].
 _EPOCH_S = 1e9
-#: Unit of the dates of spreadsheets, and their values in the years 1968 to 2119.
-_SERIAL_DAYS, _SERIAL_RANGE = "days since 1899-12-30", (25_000.0, 80_000.0)
+#: Units of the dates of spreadsheets and of MATLAB, and their values in the years 1968 to 2119.
+_SERIAL_DAYS = {"days since 1899-12-30": (25_000.0, 80_000.0), DATENUM: (718_960.0, 773_960.0)}
 
 
 def given_unit(column: ColumnInspection, quantity: str = "rate") -> bool:
@@ -273,9 +273,8 @@ def _time_unit(column: ColumnInspection) -> tuple[str, str]:
     for unit in _UNITS:
         if 1.0 <= column.first * unit_seconds(unit) / _EPOCH_S < 2.0:
             return unit, "its size, that of Unix time"
-    low, high = _SERIAL_RANGE
-    units = (*_UNITS, _SERIAL_DAYS) if low <= column.first < high else _UNITS
-    unit = min(units, key=lambda unit: _rate_distance(column, unit))
+    serials = [unit for unit, (low, high) in _SERIAL_DAYS.items() if low <= column.first < high]
+    unit = min([*_UNITS, *serials], key=lambda unit: _rate_distance(column, unit))
     return unit, f"the rate of {1.0 / (column.pace * unit_seconds(unit)):.4g} Hz that it gives"
 
 

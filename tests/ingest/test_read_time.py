@@ -68,6 +68,18 @@ def test_dates_outside_64_bits_are_counted_or_refused(tmp_path, name, year):
         read_log(write_dates(tmp_path / f"all_{name}", dates(year)))
 
 
+@pytest.mark.parametrize("name", ["log.csv", "log.parquet"])
+def test_serial_dates_of_matlab_have_a_unit(tmp_path, name):
+    days = 719_529.25 + np.arange(ROWS) / 64  # 1970-01-01T06:00
+    table = pd.DataFrame({"t": days, "gyro_x [deg/h]": np.arange(ROWS)})
+    path = tmp_path / name
+    table.to_csv(path, index=False) if path.suffix == ".csv" else table.to_parquet(path)
+    expected = np.datetime64("1970-01-01T06:00") + np.arange(ROWS) * np.timedelta64(1350, "s")
+    np.testing.assert_array_equal(read_log(path, unit={"time": "datenum"}).time.values, expected)
+    with pytest.raises(FormatError, match="--unit time=datenum"):
+        read_log(path, unit={"time": "day"})
+
+
 @pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
 def test_dates_of_every_unit_of_parquet(tmp_path, unit):
     stamps = dates(2026, unit)

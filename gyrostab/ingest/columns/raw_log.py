@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Buffers, find_even
 from gyrostab.ingest.columns.plan import Column, Plan
-from gyrostab.ingest.columns.stamps import NAT, TurningClock
+from gyrostab.ingest.columns.stamps import DATENUM, NAT, TurningClock
 from gyrostab.ingest.options import FileSummary
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import Converted, make_dask, read_slice, stack_rows
 from gyrostab.store.write import pack_counts
+from gyrostab.units import DAY
 
 #: Largest number of bad places that a note lists.
 MAX_NAMED_PLACES = 10
@@ -213,6 +214,9 @@ class RawLogBuilder:
                 "the separator, the columns that --map names and the unit of time (stamps lie "
                 "in the years 1678 to 2262)"
             )
+            unit = None if self.time is None else self.time.time_unit
+            if unit is not None and unit.epoch is None and unit.ns == int(DAY) * 10**9:
+                suspects += f"; of serial dates of MATLAB it is --unit time={DATENUM}"
             raise FormatError(
                 f"{name}: {100 * share:.0f} % of {rows} rows are unreadable, the first is {first}"
                 f"{written}; look at it, and check {suspects}"

@@ -52,6 +52,8 @@ _UNITS = {
     86400 * 10**9: ("d", "day", "days"),
     7 * 86400 * 10**9: ("week", "weeks"),
 }
+#: Unit of the serial dates of MATLAB, days, and the one of 1970-01-01.
+DATENUM, _DATENUM_1970 = "datenum", 719_529
 _NANOSECONDS = {spelling: ns for ns, spellings in _UNITS.items() for spelling in spellings}
 _SINCE = re.compile(r"\bsince\b", re.IGNORECASE)
 #: Calendars in which a date is an instant; the others are calendars of climate models.
@@ -90,9 +92,9 @@ def names_epoch(text: str) -> bool:
 def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
     """Parse a time unit, with an optional leading factor and an optional CF epoch.
 
-    It is not case-sensitive, as in UDUNITS. `calendar` is the CF calendar of the epoch. `UnitError`
-    when the text is not a time unit, when its epoch is ambiguous or depends on the clock, or when
-    the calendar is not one of real dates.
+    It is not case-sensitive, as in UDUNITS. `calendar` is the CF calendar of the epoch. ``datenum``
+    is the unit of the serial dates of MATLAB. `UnitError` when the text is not a time unit, when
+    its epoch is ambiguous or depends on the clock, or when the calendar is not one of real dates.
 
     Examples
     --------
@@ -101,6 +103,8 @@ def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
     >>> parse_time_unit("Seconds Since 1970-01-02 00:00:00").epoch
     86400000000000
     """
+    if text.strip().lower() == DATENUM:
+        return TimeUnit(text, Fraction(int(DAY) * 10**9), -_DATENUM_1970 * int(DAY) * 10**9)
     name, *since = (part.strip() for part in _SINCE.split(text, maxsplit=1))
     epoch = _epoch_ns(text, since[0], calendar) if since else None
     factor, _, bare = name.rpartition(" ")
@@ -110,7 +114,9 @@ def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
     if ns is None or (
         factor and not (len(factor) <= _MAX_DIGITS and _NUMBER.match(factor.strip()))
     ):
-        units = "s, ms, us, ns, min, h, d, week, with a factor in front if needed"
+        units = (
+            "s, ms, us, ns, min, h, d, week, with a factor in front if needed, and datenum (MATLAB)"
+        )
         raise UnitError(
             f"time unit {text!r} is not known; known are {units}; months and years have no fixed "
             "length"
