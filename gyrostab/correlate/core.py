@@ -122,7 +122,7 @@ def correlate(
         for v, name in enumerate(names)
         for a in range(product.sizes["axis"])
     }
-    known, counts = _known_windows(drivers, share=len(channels) == 1)
+    known, counts = _known_windows(drivers)
     coverage = product["window_coverage"].values.astype(np.float64)
 
     @functools.cache
@@ -225,17 +225,12 @@ def _usable_series(product: xr.Dataset, name: str, axis: int) -> Array:
     return np.where(good, part[name].values, np.nan)
 
 
-def _known_windows(
-    drivers: list[Driver], *, share: bool
-) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+def _known_windows(drivers: list[Driver]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Find the windows in which each driver is known at every lag, and its number of lags.
 
-    Lags that would cost more than a third of the windows are left out. A channel and its rate of
-    change `share` their windows.
+    Lags that would cost more than a third of the windows are left out.
     """
     is_known = np.logical_and.accumulate([np.isfinite(driver.values) for driver in drivers], axis=1)
-    if share:
-        is_known[:] = is_known.all(axis=0)
     windows = is_known.sum(axis=2)
     counts = np.array([np.flatnonzero(row >= 2 / 3 * row[0])[-1] + 1 for row in windows])
     return is_known[np.arange(len(drivers)), counts - 1], counts

@@ -198,11 +198,11 @@ def _align_product_channel(
         + 1e-6
     )
     mean = _bridge_gaps(mean, max_windows)
+    rate = np.full(mean.size, np.nan)
     if f"{name}_rate" in product.data_vars:
-        rate = np.full(mean.size, np.nan)
         rate[place] = product[f"{name}_rate"].values
         rate = _bridge_gaps(rate, max_windows)
-    else:
+    if np.isfinite(rate).sum() < 2 / 3 * np.isfinite(mean).sum():  # most windows hold one value
         rate = _difference_means(mean, step)
     return [_shift_by_lags(row, 0, place, lags) for row in (mean, rate)]
 

@@ -485,6 +485,35 @@ def test_a_slow_channel_is_interpolated_between_its_values_only():
     assert np.isnan(aligned[~known]).all()
 
 
+def test_a_rate_of_change_without_values_takes_no_windows_from_its_channel():
+    product = coupled.product(slope=0.3, noises="white", terms=False)
+    options = {"variables": "window_mean", "max_lag": "5min"}
+    complete = gyrostab.correlate(product, **options)
+    rate = product["temperature_rate"]
+    few = rate.where(np.arange(rate.size) % 5 == 0).where(np.arange(rate.size) < 60)
+    for unknown in (rate * np.nan, few):
+        part = product.assign(temperature_rate=unknown.assign_attrs(rate.attrs))
+        correlation = gyrostab.correlate(part, **options)
+        warm = {"driver": "temperature"}
+        for name in ("windows_used", "p_value", "coupling_verdict"):
+            np.testing.assert_array_equal(correlation[name].sel(warm), complete[name].sel(warm))
+
+
+def test_the_rate_of_a_channel_with_one_value_per_window_is_that_of_its_means():
+    product = coupled.product(pace=0.05, noises="white", terms=False)
+    unknown = product["temperature_rate"] * np.nan
+    options = {"variables": "window_mean", "max_lag": 0}
+    correlation = gyrostab.correlate(
+        product.assign(temperature_rate=unknown.assign_attrs(units="K hour-1")), **options
+    )
+    place = {"axis": "x", "variable": "window_mean", "driver": "temperature_rate"}
+    assert verdict(correlation, **place) == "coupled"
+    low, high = (
+        float(correlation[f"window_mean_per_temperature_rate_{end}"][0]) for end in ("low", "high")
+    )
+    assert low < 0.05 < high
+
+
 def test_command_refuses_options_that_it_does_not_use(stored, capsys):
     assert main(["correlate", str(stored), "--rate", "100"]) == 2
     assert "--rate" in capsys.readouterr().err
