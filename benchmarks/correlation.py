@@ -3,7 +3,8 @@
     python benchmarks/correlation.py --output docs/temperature.md
 
 False claims and coverage of the intervals against Pearson, ordinary least squares and Newey-West
-(statsmodels), and power against an oracle that knows the noise; all on simulated records
+(statsmodels), power against an oracle that knows the noise, and how often a temperature and its
+rate of change are taken for each other; all on simulated records
 (tests/support/coupled.py) whose seeds count from `SEED`, so that the same command makes the same
 tables.
 """
@@ -37,7 +38,11 @@ NAMES = {
     "slow": "white + slow autoregression",
 }
 HEATS = {"sine": "sine", "ramps": "ramps and plateaus", "walk": "random walk"}
+CYCLE = {"chamber": "chamber cycles"}
+TOLD_APART = (("white", "chamber"), ("walk", "chamber"), ("white", "walk"), ("white", "sine"))
 STRENGTHS = (2, 4, 8)
+#: Standard deviation of an effect, in those of white noise in half a window.
+EFFECT_SIGMA = 3.0
 
 
 def judge(noises: str, heat: str, seed: int) -> tuple[bool, ...]:
@@ -96,6 +101,22 @@ def seen(
     )
 
 
+def claim(noises: str, heat: str, effect: str, seed: int) -> tuple[bool, bool]:
+    """Return whether gyrostab claims that the mean follows temperature, and its rate of change.
+
+    The mean follows one of them, which is the `effect`.
+    """
+    warm = coupled.temperature(heat, 161, np.random.default_rng(seed))
+    rate = np.gradient(warm, coupled.CELL / 3600)
+    follows = {"slope": EFFECT_SIGMA / warm.std()}
+    if effect == "rate":
+        follows = {"pace": EFFECT_SIGMA / rate.std()}
+    product = coupled.product(seed=seed, noises=noises, heat=heat, axes="x", terms=False, **follows)
+    correlation = gyrostab.correlate(product, variables="window_mean")
+    first, second = correlation["coupling_verdict"].values.ravel() == VERDICTS.index("coupled")
+    return bool(first), bool(second)
+
+
 def whitener(noises: str) -> np.ndarray:
     """What makes the noise of the windows white, from 20 000 records of noise alone."""
     good = np.isfinite(coupled.product(terms=False)["window_mean"].values[0])
@@ -135,13 +156,26 @@ def power(spread: Callable[..., Any], records: int) -> str:
     return table(["noise", "temperature", *heads], rows)
 
 
+def tell_apart(spread: Callable[..., Any], records: int) -> str:
+    rows = []
+    for noises, heat in TOLD_APART:
+        claims = [
+            share(spread, partial(claim, noises, heat, effect), 5 * records // 8)
+            for effect in ("temperature", "rate")
+        ]
+        course = (HEATS | CYCLE)[heat]
+        rows.append([NAMES[noises], course, *(f"{a:.0%}, {b:.0%}" for a, b in claims)])
+    heads = [f"follows {effect}: temperature, rate" for effect in ("temperature", "its rate")]
+    return table(["noise", "temperature", *heads], rows)
+
+
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--records", type=int, default=160)
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     chosen = parser.parse_args()
     with Pool(chosen.processes) as pool:
-        for name, make_table in {"compared": compare, "power": power}.items():
+        for name, make_table in {"compared": compare, "power": power, "apart": tell_apart}.items():
             text = make_table(pool.map, chosen.records)
             print(f"{name}\n{text}\n", flush=True)
             renew(chosen.output, name, text)

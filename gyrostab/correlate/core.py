@@ -44,7 +44,9 @@ def correlate(
     """Estimate the coupling of window means and coefficients with a channel and its rate of change.
 
     Each series is regressed on the driver at every lag by generalised least squares, together with
-    a constant, a trend in time and a constant for every segment between long gaps. The noise of the
+    a constant, a trend in time and a constant for every segment between long gaps; then on all
+    drivers together, each at its best-fitting lag, so that the effect of a channel is not taken for
+    one of its rate of change. The noise of the
     series is white (shared by overlapping windows) plus a slow part of unknown strength and memory;
     slopes and p-values are averaged over these noise laws, weighted by their restricted likelihood.
     The p-value allows for the search over lags (by simulation with a fixed seed) and over axes,
@@ -57,10 +59,10 @@ def correlate(
     channel : str, DataArray or sequence of them
         Channel of the product, or a channel with a separate time coordinate, which is averaged over
         the windows. With several, the rates of change are drivers only if they are named
-        (``["temperature", "temperature_rate", "vibration"]``), and the partial effect of each
-        driver is estimated, given the others at their best-fitting lags, from the windows in which
-        all are known. A driver that cannot be fitted alone, for instance one without values, is
-        left out of these effects.
+        (``["temperature", "temperature_rate", "vibration"]``). The partial effect of each driver
+        is estimated, given the others at their best-fitting lags, from the windows in which all are
+        known. A driver that cannot be fitted alone, for instance one without values, is left out of
+        these effects.
     variables : str or sequence of str, optional
         Names with dims ``(axis, time)``; by default ``window_mean`` and every coefficient that is
         observed in at least one window.
@@ -78,8 +80,8 @@ def correlate(
         ``p_value_adjusted``, ``effective_samples``, ``windows_used``, ``coupling_verdict``,
         ``coupling_limits`` (flags), ``statement``; by ``axis`` the sensitivity
         ``<variable>_per_<driver>`` with ``_stderr``, ``_low``, ``_high``, ``_rising``, ``_falling``
-        [units of the variable per unit of the driver]; and the series themselves. With several
-        channels also ``p_value_partial``, and ``<variable>_per_<driver>_partial`` with
+        [units of the variable per unit of the driver]; and the series themselves. Given the other
+        drivers: ``p_value_partial``, and ``<variable>_per_<driver>_partial`` with
         ``_partial_stderr``, ``_partial_low``, ``_partial_high``.
 
     Raises
@@ -147,11 +149,11 @@ def correlate(
                 entries |= {(*place, d): entry for place, entry in zip(places, fitted, strict=True)}
         if len(channels) > 1:
             _note_empty_drivers(drivers)
-            for (a, v), row in series.items():
-                of_series = [entries[a, v, d] for d in range(len(drivers))]
-                shared = known[["best" in entry for entry in of_series]].all(axis=0)
-                blocks = find_blocks((np.isfinite(row) & shared).tobytes(), coverage[a].tobytes())
-                fit_partial_effects(blocks, row, drivers, of_series, level)
+        for (a, v), row in series.items():
+            of_series = [entries[a, v, d] for d in range(len(drivers))]
+            shared = known[["best" in entry for entry in of_series]].all(axis=0)
+            blocks = find_blocks((np.isfinite(row) & shared).tobytes(), coverage[a].tobytes())
+            fit_partial_effects(blocks, row, drivers, of_series, level)
     _adjust_p_values(entries)
     for (a, v, d), entry in entries.items():
         entry["unit_label"] = slope_label(product[names[v]], drivers[d].units)

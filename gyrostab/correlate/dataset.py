@@ -32,6 +32,7 @@ _STATISTICS = {
         "p-value adjusted for the search over lags, axes, variables and drivers",
         "1",
     ),
+    "p_value_partial": ("p_partial", "p-value of the sensitivity, given the other drivers", "1"),
     "effective_samples": ("effective", "effective number of independent samples", "1"),
 }
 #: Key of the entry, and end of the long name of each number of a sensitivity.
@@ -45,11 +46,7 @@ _SLOPES = {
     "falling": ", while it falls",
     "falling_stderr": ", while it falls, standard error",
 }
-_PARTIAL_STATISTICS = {
-    "p_value_partial": ("p_partial", "p-value of the sensitivity, given the other drivers", "1")
-}
-#: The same, given the other drivers: only where several channels are named.
-_PARTIAL_SLOPES = {
+_SLOPES |= {
     "partial": ", given the other drivers",
     **{f"partial_{key}": f", given the other drivers{_SLOPES[key]}" for key in list(_SLOPES)[1:4]},
 }
@@ -86,9 +83,7 @@ def assemble(
             if driver.name in product.data_vars
             else ("time", driver.values[0], attributes)
         )
-    is_partial = "p_partial" in next(iter(entries.values()))
-    statistics = _STATISTICS | (_PARTIAL_STATISTICS if is_partial else {})
-    for name, (key, label, units) in statistics.items():
+    for name, (key, label, units) in _STATISTICS.items():
         made[name] = (dims, table(key), {"long_name": label, "units": units})
     made["windows_used"] = (
         dims,
@@ -111,7 +106,7 @@ def assemble(
                 "units": slope_units(str(product[name].attrs.get("units", "1")), driver.units),
                 "unit_label": slope_label(product[name], driver.units),
             }
-            for key, text in (_SLOPES | (_PARTIAL_SLOPES if is_partial else {})).items():
+            for key, text in _SLOPES.items():
                 suffix = "" if key == "slope" else f"_{key}"
                 series = name.replace("_", " ")
                 label = f"sensitivity of {series} to {driver.label}{text.format(level=100 * level)}"

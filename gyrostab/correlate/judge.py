@@ -25,7 +25,7 @@ LIMITS = {
     "same",
     "no_plateau": "{driver} is hardly ever constant, so its effect and that of its rate of change "
     "look alike",
-    "other_channel": "another channel explains it equally well",
+    "other_channel": "another channel or rate of change explains it equally well",
     "no_values": "{driver} has no value in any window",
     "constant_series": "{series} is constant",
 }
@@ -214,7 +214,7 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
                         f"{100 * result.attrs['interval_level']:g} % interval": "-"
                         if np.isnan(low)
                         else f"{low:.3g} .. {high:.3g}",
-                        **_partial_column(cell, f"{name}_per_{driver}_partial"),
+                        "given the others": _format_partial(cell, f"{name}_per_{driver}_partial"),
                         "unit": str(slope.attrs["unit_label"]),
                         "r": r,
                         "n eff": n,
@@ -225,14 +225,10 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
     return rows
 
 
-def _partial_column(cell: xr.Dataset, name: str) -> dict[str, str]:
-    """Format the slope given the other drivers, if there is one."""
-    if name not in cell:
-        return {}
+def _format_partial(cell: xr.Dataset, name: str) -> str:
+    """Format the slope given the other drivers."""
     value, low, high = (float(cell[f"{name}{end}"]) for end in ("", "_low", "_high"))
-    return {
-        "given the others": "-" if np.isnan(value) else f"{value:.3g} ({low:.3g} .. {high:.3g})"
-    }
+    return "-" if np.isnan(value) else f"{value:.3g} ({low:.3g} .. {high:.3g})"
 
 
 def format_correlation(result: xr.Dataset) -> str:

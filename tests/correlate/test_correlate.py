@@ -79,7 +79,8 @@ def test_statement_and_table_give_the_units_of_the_coefficients():
     units = {"N": "deg/sqrt(h)/K", "window_mean": "deg/h/K"}
     for name, unit in units.items():
         place = {"axis": "x", "variable": name, "driver": "temperature"}
-        assert f") {unit}, p" in str(correlation["statement"].sel(place).values)
+        statement = str(correlation["statement"].sel(place).values)
+        assert f") {unit}, given the other drivers" in statement
     rows = gyrostab.correlation_rows(correlation)
     assert {row["variable"]: row["unit"] for row in rows if row["driver"] == "temperature"} == units
     assert correlation["N_per_temperature_rate"].attrs["unit_label"] == "deg/sqrt(h) h/K"
@@ -97,6 +98,24 @@ def test_coupling_with_the_rate_of_change_is_found():
         float(correlation[f"window_mean_per_temperature_rate_{end}"][0]) for end in ("low", "high")
     )
     assert low < 0.05 < high
+
+
+def test_an_effect_of_temperature_is_not_taken_for_one_of_its_rate_and_the_reverse():
+    options = {"variables": "window_mean"}
+    kind = {"noises": "white", "heat": "chamber", "axes": "x", "terms": False, "windows": 240}
+    drivers = ["temperature", "temperature_rate"]
+    for effect, follows in (({"slope": 0.1}, drivers), ({"pace": 0.004}, drivers[::-1])):
+        correlation = gyrostab.correlate(coupled.product(**kind, **effect), **options)
+        place = {"axis": "x", "variable": "window_mean"}
+        assert (correlation["p_value_adjusted"].sel(place) < 0.05).all()  # each alone
+        verdicts = [verdict(correlation, **place, driver=driver) for driver in follows]
+        assert verdicts == ["coupled", "not_told_apart"]
+        size = float(correlation[f"window_mean_per_{follows[0]}_partial"][0])
+        error = float(correlation[f"window_mean_per_{follows[0]}_partial_stderr"][0])
+        assert abs(size - next(iter(effect.values()))) < 4 * error < size
+    named = gyrostab.correlate(coupled.product(**kind, **effect), channel=drivers, **options)
+    for name in ("p_value_partial", "coupling_verdict"):
+        np.testing.assert_array_equal(named[name], correlation[name])
 
 
 def test_rising_and_falling_slopes_are_fitted_separately():
@@ -142,7 +161,7 @@ def test_partial_effects_separate_two_drivers_that_move_together():
     )
     assert low < 0.0 < high
     assert correlation["p_value_partial"].sel(shaken) > 0.05
-    assert "another channel explains it equally well" in str(
+    assert "another channel or rate of change explains it equally well" in str(
         correlation["statement"].sel(shaken).values
     )
     assert "given the other drivers" in format_correlation(correlation)

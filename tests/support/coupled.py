@@ -20,6 +20,8 @@ def temperature(kind: str, cells: int, rng: np.random.Generator) -> np.ndarray:
         return 40 + 10 * np.sin(2 * np.pi * (rng.uniform(1, 4) * t + rng.uniform()))
     if kind == "walk":
         return 40 + np.cumsum(rng.normal(0, 0.3, cells))
+    if kind == "chamber":  # three cycles of a thermal chamber
+        return 20 + 60 * np.interp(3 * t % 1, [0, 0.25, 0.375, 0.625, 0.75, 1], [0, 0, 1, 1, 0, 0])
     if kind == "rise":
         return 40 + 10 * t + 3 * t**2
     return np.full(cells, 40.0)

@@ -69,8 +69,8 @@ def correlate(
 ) -> None:
     """Correlate noise coefficients and window means with temperature or other channels.
 
-    Prints which quantities follow the channel, how strongly, and with what lag. With several
-    channels, it also prints the effect of each given the others.
+    Prints which quantities follow the channel or its rate of change, how strongly, and with what
+    lag, and the effect of each of these drivers given the others.
 
     Example: gyrostab correlate product.nc --with temperature,vibration --max-lag 2h -o coupling.nc
 
