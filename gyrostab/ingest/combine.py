@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any
@@ -16,7 +17,7 @@ from gyrostab.ingest.columns.stamps import CLOCK_PERIODS, NAT, read_stamps, typi
 from gyrostab.ingest.concat.core import absence_notes, merge_notes, unify_units
 from gyrostab.ingest.concat.grid import group_axes, split_axes
 from gyrostab.ingest.concat.place import COMPARED_SAMPLES, match_ends
-from gyrostab.schema import SIGNAL_UNITS
+from gyrostab.schema import SIGNAL_UNITS, texts
 from gyrostab.store.lazy import (
     concatenate_columns,
     convert_lazy,
@@ -425,3 +426,9 @@ def _read_common(
         for part, span, axis, row in zip(parts, spans, axes, rows, strict=True)
     )
     return held, new
+
+
+def warn_notes(log: xr.Dataset) -> None:
+    """Warn with each note of a log, where the caller of the calling function is."""
+    for note in texts(log, "notes"):
+        warnings.warn(note, stacklevel=3)

@@ -21,7 +21,8 @@ from gyrostab.errors import (
     UnitError,
 )
 from gyrostab.ingest.columns.headers import quantity_of
-from gyrostab.ingest.dataframe import from_dataframe, keyword_advice, warn_notes
+from gyrostab.ingest.combine import warn_notes
+from gyrostab.ingest.dataframe import from_dataframe, keyword_advice
 from gyrostab.ingest.uniform import advise_dates, as_uniform
 from gyrostab.schema import (
     RESERVED_NAMES,

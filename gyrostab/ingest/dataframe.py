@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +18,7 @@ from gyrostab.errors import (
     SchemaError,
     TimeError,
 )
+from gyrostab.ingest.combine import warn_notes
 from gyrostab.schema import texts
 
 #: An option of a command with its value, as messages on files advise it.
@@ -259,9 +259,3 @@ def _advise_levels(index: pd.MultiIndex) -> str:
         f"take one part of the other, df.xs({index.levels[number][0]!r}, level={level!r}), or "
         f"make a column of each part of a Series, series.unstack({level!r})"
     )
-
-
-def warn_notes(log: xr.Dataset) -> None:
-    """Warn with each note of a log, where the caller of the calling function is."""
-    for note in texts(log, "notes"):
-        warnings.warn(note, stacklevel=3)

@@ -21,6 +21,7 @@ from gyrostab.ingest.combine import (
     memory_bytes,
     move_to_disk,
     stamp_span,
+    warn_notes,
 )
 from gyrostab.ingest.concat.core import concatenate_logs
 from gyrostab.ingest.concat.grid import log_span
@@ -207,6 +208,11 @@ def read_channel(
     FormatError, UnitError, OptionError, TimeError
         When the file cannot be read or does not contain the channel.
 
+    Warns
+    -----
+    UserWarning
+        With each note on the file, for instance on unreadable rows or codes for missing values.
+
     Examples
     --------
     >>> from tempfile import mkdtemp
@@ -216,13 +222,15 @@ def read_channel(
     array([20.5, 21. ])
     """
     options = ReadOptions(channels_only=True, epoch=epoch, map=map or {}, unit=unit or {})
-    channels = attach_channels(xr.Dataset(), [read_file(Path(path), options)])
+    table = read_file(Path(path), options)
+    channels = attach_channels(xr.Dataset(), [table])
     if name not in channels.data_vars:
         available = ", ".join(sorted(str(key) for key in channels.data_vars))
         raise OptionError(
             f"{path}: no channel {name!r}; the channels are {available}: name one of these, or "
             "rename one with --map"
         )
+    warn_notes(table)
     return channels[name]
 
 

@@ -13,7 +13,7 @@ import xarray as xr
 from gyrostab.allan.davar import davar
 from gyrostab.allan.fit import fit_noise
 from gyrostab.errors import GyrostabError, MissingUnitError, UnitError
-from gyrostab.ingest import read_log
+from gyrostab.ingest import read_channel, read_log
 from gyrostab.ingest.columns.headers import split_header
 from gyrostab.ingest.files import scan_file
 from gyrostab.ingest.grid.regularise import regularise
@@ -46,6 +46,13 @@ def test_codes_for_missing_values_are_named(
     text = "\n".join(["time [s],gyro_x [deg/h],gyro_y [deg/h]", *rows])
     raw = read_log(write(tmp_path, text))
     assert has_note(raw, words or "code for a missing value") == (words is not None)
+
+
+def test_a_channel_is_read_with_the_notes_of_its_file(tmp_path: Path) -> None:
+    rows = [f"{n / 10},{-999.25 if n % 7 == 0 else 20 + n / 10}" for n in range(140)]
+    path = write(tmp_path, "\n".join(["time [s],temperature [degC]", *rows]))
+    with pytest.warns(UserWarning, match="it is a common code for a missing value"):
+        read_channel(path)
 
 
 def test_column_named_as_a_unit_of_rate_is_kept_as_the_rotation(tmp_path: Path) -> None:
