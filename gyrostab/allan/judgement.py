@@ -261,7 +261,7 @@ def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]
         which = "five" if len(terms) == len(LAWS) else "fitted"
         return f"All {which} terms are observed {where}{_list_absences(product, absences)}."
     if len(hidden) == len(terms):  # the terms do not describe the record, which has a sentence
-        return f"No term is observed {where}."
+        return f"No term is observed {where}{_explain_coverage(product)}."
     chance = f"no more often than by chance (in up to {100 * _FALSE_ALARMS:.0f} % of them)"
     is_rare = bool(observed_share.sel(term=hidden).any())
     text = f"{join_words(hidden)} {'is' if len(hidden) == 1 else 'are'} " + (
@@ -285,6 +285,22 @@ def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]
     ]
     text += f": use a window (--window) of {format_duration(longer[-1])}"
     return text + (f", which observes {join_words(sizes)}." if sizes else ".")
+
+
+def _explain_coverage(product: xr.Dataset) -> str:
+    """Say that the samples of all windows are too few for `min_coverage`, or return ""."""
+    least = float(product.attrs.get("min_coverage", 0.0))
+    coverage = product["window_coverage"].values
+    if not (coverage.size and (coverage < least).all()):
+        return ""
+    if not coverage.any():
+        return ": they hold no sample"
+    most = float(coverage.max())
+    return (
+        f": they hold at most {100 * most:.2g} % of their samples, and averaging times of which "
+        f"less than {100 * least:g} % is left are not used; give a min_coverage (--min-coverage) "
+        f"below {most:.2g}"
+    )
 
 
 def _fitted_terms(product: xr.Dataset) -> list[str]:

@@ -178,6 +178,9 @@ class Windows:
     variance
         avar, the Allan variance. hadamard is not changed by a constant drift of the rate. modified,
         the modified Allan variance, separates white noise from quantization noise.
+    min_coverage
+        Smallest share of the second differences of a window that must be present at an averaging
+        time. Lower it for a log of short bursts.
     """
 
     window: Annotated[str | None, Parameter(metavar="DURATION")] = None
@@ -186,6 +189,7 @@ class Windows:
     tau_max: Annotated[str | None, Parameter(metavar="DURATION")] = None
     axis: Annotated[list[str] | None, Parameter(metavar="NAME", negative=())] = None
     variance: Literal["avar", "hadamard", "modified"] = "avar"
+    min_coverage: Annotated[float, Parameter(metavar="SHARE")] = 0.1
 
     def options(self) -> dict[str, Any]:
         """Return the keyword arguments of `gyrostab.allan.davar.davar`."""

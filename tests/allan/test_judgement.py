@@ -108,6 +108,21 @@ def test_a_longer_record_is_not_advised_for_what_it_cannot_show():
     assert judge_product(product)[1] == "No term is observed in windows of 6s."
 
 
+def test_windows_with_too_few_samples_have_a_sentence_on_min_coverage():
+    noise = 6.0 * np.random.default_rng(3).standard_normal(33_000)  # N = 0.014 deg/sqrt(h)
+    bursts = np.where(np.arange(noise.size) % 3000 < 240, noise, np.nan)
+    log = make_log(bursts, rate=50.0, unit="deg/h")
+    windows = {"window": "2min", "step": "1min"}
+    text = judge_product(fit_noise(davar(log, **windows)))[1]
+    assert text.startswith("No term is observed in windows of 2min: they hold at most 8 % of their")
+    assert "less than 10 % is left are not used; give a min_coverage (--min-coverage)" in text
+    product = fit_noise(davar(log, **windows, min_coverage=0.05))
+    assert (product["observable"].sel(term="N") == OBSERVED).all()
+    assert float(product["N"].median()) == pytest.approx(0.014142, rel=0.05)
+    gap = fit_noise(davar(log.assign(rate=log["rate"] * np.nan), **windows))
+    assert judge_product(gap)[1].endswith("in windows of 2min: they hold no sample.")
+
+
 def test_suggested_windows_fit_the_record():
     lines = suggest_windows(86400.0, WHITE)
     assert "N is about 0.01 deg/sqrt(h)" in lines[0]
