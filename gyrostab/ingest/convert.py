@@ -151,8 +151,9 @@ def from_dataarray(
     ----------
     da : xarray.DataArray
         On ``time`` or on ``axis`` and ``time`` in any order, with a datetime64 coordinate ``time``
-        that does not run backwards. Samples may be missing; infinite values become NaN. A lazy
-        array on a uniform time axis stays lazy.
+        that does not run backwards. Samples may be missing; infinite values become NaN. Numeric
+        coordinates on ``time``, such as a temperature, become channels. A lazy array on a uniform
+        time axis stays lazy.
     units : str, optional
         Unit of the values; ``da.attrs["units"]`` by default.
     kind : {"rate", "angle"}, optional
@@ -274,9 +275,8 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
         count = int(np.isinf(signal.data).sum())
         log_attrs["unreadable_cells"] = count
         log_attrs["notes"] = [f"DataArray: {count} gyro cells are infinite and become NaN"]
-    bare = array.coords.to_dataset().drop_vars(
-        [coord for coord in array.coords if coord not in ("time", "axis")]
-    )
+    bare = _convert_channels(_reset_channels(array.coords.to_dataset()))
+    bare = bare.drop_vars([coord for coord in bare.coords if coord not in ("time", "axis")])
     log = bare.assign({name: (("axis", "time"), data, attrs, packing)})
     return log.assign_coords(axis=axes).assign_attrs(log_attrs), increments
 

@@ -172,3 +172,21 @@ def test_infinite_values_of_labelled_data_are_missing_and_counted(make, missing)
     np.testing.assert_array_equal(log.rate.values[0], expected)
     assert log.attrs["unreadable_cells"] == (3 if make == "from_dataarray" else 4)
     assert not any(np.isinf(item.values).any() for item in log.values() if item.dtype.kind == "f")
+
+
+@pytest.mark.parametrize("present", [slice(None), np.r_[0:200, 320:400]])
+def test_coordinates_of_a_dataarray_are_channels(present):
+    time = pd.date_range("2026-03-14", periods=400, freq="20ms")
+    warm = np.linspace(20.0, 30.0, 400)
+    coordinates = {
+        "time": time,
+        "temperature": ("time", 32 + 1.8 * warm, {"units": "degF"}),
+        "run": 7,
+    }
+    data = xr.DataArray(np.ones(400), coordinates, ("time",), attrs={"units": "deg/h"})
+    log = gyrostab.from_dataarray(data[present])
+    np.testing.assert_allclose(log["temperature"].sel(time=time[present]), warm[present])
+    assert log["temperature"].attrs["units"] == "degree_Celsius"
+    assert "run" not in log.variables
+    surface = gyrostab.davar(data[present], window="2s")
+    assert float(surface["temperature"][0]) == pytest.approx(warm[:100].mean())
