@@ -262,7 +262,8 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
     axes = name_axes(da)
     array = da if "axis" in da.dims else da.drop_vars("axis", errors="ignore").expand_dims("axis")
     signal = array.variable.transpose("axis", "time")
-    values = hide_infinite(signal.data)
+    given = signal.data  # read once: xarray reads a variable of a file anew
+    values = hide_infinite(given)
     data = values * unit.factor if unit.factor != 1.0 else values
     packing = (
         declare_counts(signal.dtype, unit.factor)
@@ -271,8 +272,7 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
     )
     attrs = {"long_name": SIGNAL_LONG_NAMES[name], **da.attrs, "units": SIGNAL_UNITS[name]}
     log_attrs: dict[str, Any] = {"kind": name}
-    if isinstance(values, np.ndarray) and values is not signal.data:
-        count = int(np.isinf(signal.data).sum())
+    if isinstance(values, np.ndarray) and (count := int(np.isinf(given).sum())):
         log_attrs["unreadable_cells"] = count
         log_attrs["notes"] = [f"DataArray: {count} gyro cells are infinite and become NaN"]
     bare = _convert_channels(_reset_channels(array.coords.to_dataset()))

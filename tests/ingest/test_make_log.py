@@ -190,3 +190,12 @@ def test_coordinates_of_a_dataarray_are_channels(present):
     assert "run" not in log.variables
     surface = gyrostab.davar(data[present], window="2s")
     assert float(surface["temperature"][0]) == pytest.approx(warm[:100].mean())
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_array_of_a_file_without_infinite_values_has_no_note(tmp_path):
+    path = tmp_path / "log.nc"
+    gyrostab.to_netcdf(make_log(np.resize(VALUES, 400), rate=10.0, unit="deg/h"), path)
+    with xr.open_dataset(path) as stored:
+        log = gyrostab.from_dataarray(stored["rate"])
+    assert "notes" not in log.attrs
