@@ -153,6 +153,8 @@ RESERVED_NAMES = frozenset(
         *VARIABLES,
         *("row", "gap", "gap_start", "gap_end", "gap_samples", "gap_rows", "gap_cause"),
         *("bnds", "time_bounds", "time_start", "time_index"),
+        # dimensions of texts in NetCDF files of xarray, by their length
+        *(f"string{length}" for length in range(1, 256)),
     }
 )
 

@@ -199,3 +199,15 @@ def test_an_array_of_a_file_without_infinite_values_has_no_note(tmp_path):
     with xr.open_dataset(path) as stored:
         log = gyrostab.from_dataarray(stored["rate"])
     assert "notes" not in log.attrs
+
+
+def test_a_channel_is_not_called_like_a_dimension_of_texts_in_a_file(tmp_path):
+    with pytest.raises(OptionError, match="'string1': variables of gyrostab have this name"):
+        make_log(VALUES, rate=10.0, unit="deg/h", channels={"string1": (VALUES, "V")})
+    rows = "\n".join(f"{n / 10},{value},5" for n, value in enumerate(np.resize(VALUES, 400)))
+    path = tmp_path / "log.csv"
+    path.write_text(f"time [s],gyro_x [deg/h],string1 [V]\n{rows}\n")
+    log = gyrostab.regularise(gyrostab.read_log(path))
+    product = gyrostab.fit_noise(gyrostab.davar(log, window="10s"))
+    stored = gyrostab.to_netcdf(product, tmp_path / "product.nc")
+    assert "string1_channel" in gyrostab.open_product(stored)
