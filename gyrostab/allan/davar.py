@@ -70,7 +70,7 @@ def davar(
     taus : int, {"octave", "all"} or sequence
         Averaging times: a number of them, evenly spaced in log tau; powers of two samples; every
         one; or a list [s] (numbers, or strings such as ``"0.1s"``). Each is rounded to a whole
-        number of samples and reported exactly.
+        number of samples and reported exactly, with a warning if it changes by more than a fifth.
     tau_max : float or str, optional
         Longest averaging time [s]; a third of the window by default (L13), at most half of it.
     axis : str or sequence of str, optional

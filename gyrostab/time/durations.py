@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,13 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from gyrostab.errors import OptionError
+from gyrostab.wording import list_some
 
 #: Examples of averaging times, for messages.
 TAUS = "40 (how many), octave, all or 0.1s,1s,10s for taus (--taus)"
+#: Largest share by which an averaging time of a list is rounded without a warning: from three
+#: samples on, none is rounded by more.
+_MAX_ROUNDING_SHARE = 0.2
 #: Part of the window that the longest averaging time takes, by the order of the differences.
 _PARTS = {2: "half", 3: "a third"}
 _SAMPLE_COUNT = re.compile(r"^\s*(\d{1,18})\s*samples?\s*$", re.ASCII)
@@ -217,9 +222,10 @@ def averaging_factors(
 
 def _listed_factors(taus: Any, rate: float, longest: int, order: int) -> NDArray[np.int64]:
     """Return the averaging factors of a list of durations, of which `longest` is the largest."""
-    ks = []
+    ks, moved = [], []
     for tau in taus:
-        k = round(duration_seconds(tau, "tau", example=TAUS) * rate)
+        samples = duration_seconds(tau, "tau", example=TAUS) * rate
+        k = round(samples)
         if k < 1:
             raise OptionError(
                 f"tau {_show_length(tau)} is shorter than one sample at {rate:g} Hz; "
@@ -232,4 +238,12 @@ def _listed_factors(taus: Any, rate: float, longest: int, order: int) -> NDArray
                 "fits; give a longer window (--window) or shorter taus (--taus)"
             )
         ks.append(k)
+        if abs(k - samples) > _MAX_ROUNDING_SHARE * samples:
+            moved.append(f"{_show_length(tau)} to {k / rate:g} s")
+    if moved:
+        warnings.warn(
+            f"averaging times (--taus) are rounded to whole samples at {rate:g} Hz: "
+            + list_some(moved),
+            stacklevel=5,
+        )
     return np.unique(np.asarray(ks, dtype=np.int64))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -44,6 +46,15 @@ def test_lengths_out_of_range_are_refused_clearly(value):
         samples(value, 100.0, "window")
     with pytest.raises(OptionError):
         duration_seconds(value, "window")
+
+
+def test_averaging_times_that_rounding_changes_have_a_warning():
+    with pytest.warns(UserWarning, match="at 50 Hz: '0.013s' to 0.02 s, '0.03s' to 0.04 s"):
+        factors = averaging_factors("0.013s,0.03s,0.05s,1s", rate=50.0, window=1000)
+    assert factors.tolist() == [1, 2, 50]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert averaging_factors("0.0195s,0.07s", rate=50.0, window=1000).tolist() == [1, 4]
 
 
 def test_tau_max_limits_a_list():
