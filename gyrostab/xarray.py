@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from contextlib import ExitStack
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,11 +56,14 @@ class GyroAccessor:
         """Fit the noise terms to a surface; options of `gyrostab.fit_noise`.
 
         Compute the surface first if this is a log or signal; the options then are those of
-        `gyrostab.davar`.
+        `gyrostab.davar` (also ``tau_max``), and the others of `gyrostab.fit_noise`.
         """
         if self._holds_variable("avar"):
             return gyrostab.fit_noise(self._data, **options)
-        return gyrostab.fit_noise(self.davar(**options))
+        of_fit = {*signature(gyrostab.fit_noise).parameters}
+        of_fit -= {*signature(gyrostab.davar).parameters}
+        fitting = {name: options.pop(name) for name in of_fit & {*options}}
+        return gyrostab.fit_noise(self.davar(**options), **fitting)
 
     def plot(self, **options: Any) -> Figure:
         """Draw a log or signal, a surface, or the coefficients of a product.

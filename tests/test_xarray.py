@@ -219,6 +219,8 @@ def test_the_accessor_calls_the_functions(tmp_path):
     xr.testing.assert_identical(
         log.gyro.fit(window="600s", taus="octave"), gyrostab.fit_noise(surface)
     )
+    fitted = log.gyro.fit(window="600s", taus="octave", terms="QNB")
+    xr.testing.assert_identical(fitted, product)
     assert [repr(data.gyro).split(":")[0] for data in (log, log.rate, surface, product)] == [
         "<gyrostab log", "<gyrostab log", "<gyrostab surface", "<gyrostab product",
     ]  # fmt: skip

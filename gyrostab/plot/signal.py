@@ -67,7 +67,7 @@ def plot_signal(
     Raises
     ------
     OptionError
-        If the axis or a channel is not in the log.
+        If the axis or a channel is not in the log, or `columns` is less than 1.
 
     Examples
     --------
@@ -78,6 +78,8 @@ def plot_signal(
     'x [deg/h]'
     """
     log = as_log(log)
+    if columns < 1:
+        raise OptionError(f"columns={columns!r}: give a number above 0, for instance 1500")
     name = signal_name(log)
     axes, available = axis_names(log, axis), log_channels(log)
     channels = [channels] if isinstance(channels, str) else channels
