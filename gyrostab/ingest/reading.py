@@ -124,8 +124,8 @@ def read_log(
     >>> raw = read_log(path)
     >>> raw.rate.sel(axis="x").values
     array([1800.,   nan,  900.])
-    >>> raw.attrs["notes"][-1]
-    'log.csv: 1 of 3 rows are unreadable: line 3 (\'****\')'
+    >>> print(raw.attrs["notes"][-1])
+    log.csv: 1 of 3 rows are unreadable: line 3 ('****')
     """
     options = ReadOptions(
         rate=rate,

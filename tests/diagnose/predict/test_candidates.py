@@ -300,6 +300,7 @@ def test_simulated_wander_has_the_predicted_variance():
 def test_nuisance_alternatives_have_the_axes_of_the_record(plain):
     assert {alternative.statistic.name for alternative in nuisance_alternatives(plain)} == {
         "mean",
+        "random_process",
         "power",
         "telegraph",
         "cross_spectrum",
