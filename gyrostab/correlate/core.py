@@ -155,7 +155,10 @@ def correlate(
             blocks = find_blocks((np.isfinite(row) & shared).tobytes(), coverage[a].tobytes())
             fit_partial_effects(blocks, row, drivers, of_series, level)
     _adjust_p_values(entries)
+    is_pair = [driver.name for driver in drivers[1:]] == [f"{drivers[0].name}_rate"]
     for (a, v, d), entry in entries.items():
+        twin = entries[a, v, 1 - d] if is_pair else None
+        entry["verdict"] = VERDICTS.index(_judge_coupling(entry, twin))
         entry["unit_label"] = slope_label(product[names[v]], drivers[d].units)
         series_name = f"{names[v].replace('_', ' ')} of axis {product['axis'].values[a]}"
         entry["statement"] = describe_coupling(entry, drivers[d].label, series_name)
@@ -250,7 +253,7 @@ def _note_empty_drivers(drivers: list[Driver]) -> None:
 
 
 def _adjust_p_values(entries: dict[tuple[int, int, int], dict[str, Any]]) -> None:
-    """Adjust the p-values of all entries by Holm's method, and set the verdicts."""
+    """Adjust the p-values of all entries by Holm's method."""
     tested = sorted(
         (entry for entry in entries.values() if np.isfinite(entry["p_search"])),
         key=lambda entry: float(entry["p_search"]),
@@ -262,24 +265,25 @@ def _adjust_p_values(entries: dict[tuple[int, int, int], dict[str, Any]]) -> Non
         )
     for entry in entries.values():
         entry.setdefault("p_adjusted", np.nan)
-        if entry["limits"] & {"constant", "too_few", "clusters"} or not np.isfinite(
-            entry["p_search"]
-        ):
-            verdict = "cannot_tell"
-        elif (
-            entry["p_adjusted"] >= SIGNIFICANCE
-            and entry.get("p_white", 1.0) * len(tested) < SIGNIFICANCE
-        ):
-            verdict = "not_told_apart"
-        elif entry["p_adjusted"] >= SIGNIFICANCE:
-            verdict = "none_seen"
-        else:
-            # a partial effect that cannot be estimated (NaN) does not count as evidence
-            if not all(entry.get(p, 0.0) < SIGNIFICANCE for p in ("p_channels", "p_partial")):
-                entry["limits"].add("other_channel")
-            verdict = (
-                "not_told_apart"
-                if entry["limits"] & {"no_reversal", "other_channel"}
-                else "coupled"
-            )
-        entry["verdict"] = VERDICTS.index(verdict)
+        entry["tests"] = len(tested)
+
+
+def _judge_coupling(entry: dict[str, Any], twin: dict[str, Any] | None) -> str:
+    """Return the verdict on a coupling, and add what limits it.
+
+    `twin` is the coupling with the rate of change of the same channel, or with the channel of the
+    same rate of change, if these are the only drivers. Where the record does not tell both apart,
+    the one with the shorter lag is the plainer explanation.
+    """
+    if entry["limits"] & {"constant", "too_few", "clusters"} or not np.isfinite(entry["p_search"]):
+        return "cannot_tell"
+    if entry["p_adjusted"] >= SIGNIFICANCE:
+        in_white_noise = entry.get("p_white", 1.0) * entry["tests"] < SIGNIFICANCE
+        return "not_told_apart" if in_white_noise else "none_seen"
+    # a partial effect that cannot be estimated (NaN) does not count as evidence
+    is_apart = entry.get("p_partial", 0.0) < SIGNIFICANCE
+    if not is_apart and twin is not None and not twin.get("p_partial", 0.0) < SIGNIFICANCE:
+        is_apart = entry["lag"] < twin["lag"]
+    if not (is_apart and entry.get("p_channels", 0.0) < SIGNIFICANCE):
+        entry["limits"].add("other_channel")
+    return "not_told_apart" if entry["limits"] & {"no_reversal", "other_channel"} else "coupled"

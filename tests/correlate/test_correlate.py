@@ -118,6 +118,18 @@ def test_an_effect_of_temperature_is_not_taken_for_one_of_its_rate_and_the_rever
         np.testing.assert_array_equal(named[name], correlation[name])
 
 
+@pytest.mark.parametrize(
+    ("effect", "follows"), [({"slope": 0.3}, "temperature"), ({"pace": 0.05}, "temperature_rate")]
+)
+def test_of_two_sines_the_one_with_the_shorter_lag_is_the_cause(effect, follows):
+    product = coupled.product(noises="white", heat="sine", axes="x", terms=False, **effect)
+    correlation = gyrostab.correlate(product, variables="window_mean")
+    place = {"axis": "x", "variable": "window_mean"}
+    for driver in correlation["driver"].values.tolist():
+        expected = "coupled" if driver == follows else "not_told_apart"
+        assert verdict(correlation, **place, driver=driver) == expected
+
+
 def test_rising_and_falling_slopes_are_fitted_separately():
     correlation = gyrostab.correlate(
         coupled.product(slope=0.3, noises="white", windows=240), variables="window_mean", max_lag=0
