@@ -34,7 +34,7 @@ class Spool:
         self._lock = threading.Lock()
 
     @cached_property
-    def _file(self) -> Any:
+    def _opened_file(self) -> Any:
         return tempfile.TemporaryFile(prefix="gyrostab-", buffering=0)
 
     def store(self, values: NDArray[Any]) -> SpooledPiece:
@@ -43,9 +43,9 @@ class Spool:
         try:
             with self._lock:
                 begin, view = self.end, plain.view(np.uint8).data
-                self._file.seek(begin)
+                self._opened_file.seek(begin)
                 while view.nbytes:
-                    count = self._file.write(view)
+                    count = self._opened_file.write(view)
                     view, self.end = view[count:], self.end + count
         except OSError as error:
             where = tempfile.gettempdir()
@@ -60,9 +60,9 @@ class Spool:
         """Read the bytes of a contiguous array from an offset on; threads take turns."""
         view = out.view(np.uint8).data
         with self._lock:
-            self._file.seek(begin)
+            self._opened_file.seek(begin)
             while view.nbytes:
-                got = self._file.readinto(view)
+                got = self._opened_file.readinto(view)
                 if not got:
                     raise OSError("the temporary file of a long log is shorter than it was")
                 view = view[got:]

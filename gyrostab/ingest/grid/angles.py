@@ -81,7 +81,7 @@ class TurningAngle:
         reach = _REACH * usual * times
         is_turn = (sizes > period / 2) & (np.abs(sizes - period) <= np.minimum(reach, period / 2))
         if period != _CIRCLE and is_turn.any():
-            # steps less the motion before them are the period: 1000 counts are no 10 bits
+            # steps less the motion before them are the period: 1000 counts do not pass for 10 bits
             periods = np.abs(steps - np.roll(steps / times, 1) * times)[is_turn]
             error = abs(float(np.median(periods)) - period)
             is_turn &= error <= _REACH * usual / np.sqrt(periods.size)

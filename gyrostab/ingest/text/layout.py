@@ -70,7 +70,7 @@ class Layout:
         return _join_pair(split_line(line, self.separator), self.paired)
 
     @cached_property
-    def _names(self) -> set[str]:
+    def _header_names(self) -> set[str]:
         return _bare_names(self.header_rows[0]) if self.header_rows else set()
 
     def find_header_change(self, line: str) -> tuple[str, str] | None:
@@ -78,7 +78,8 @@ class Layout:
 
         None if all cells are as in the first header, or if the line is neither header nor units.
         """
-        is_likely = 2 * sum(name in line.lower() for name in self._names) > len(self._names)
+        names = self._header_names
+        is_likely = 2 * sum(name in line.lower() for name in names) > len(names)
         if not self.header_rows or not (is_likely or self.units):
             return None
         try:
@@ -86,7 +87,7 @@ class Layout:
         except csv.Error:
             return None
         header, *units = self.header_rows
-        if is_likely and 2 * len(_bare_names(cells) & self._names) > len(self._names):
+        if is_likely and 2 * len(_bare_names(cells) & names) > len(names):
             pairs = zip_longest(cells, header, fillvalue="")
         elif units and _find_units(cells, header):
             pairs = zip_longest(cells, units[0], fillvalue="")

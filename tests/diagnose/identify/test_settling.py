@@ -61,6 +61,22 @@ def test_a_channel_that_two_others_make_superfluous_is_dropped():
     assert {identification.driver for identification in settled} == {(names[1],), (names[2],)}
 
 
+def test_two_channels_are_named_where_a_random_walk_explains_more_than_each():
+    rng = np.random.default_rng(3)
+    courses = rng.standard_normal((2, BLOCKS)).cumsum(axis=1).repeat(20, axis=1)
+    values = 0.18 * rng.standard_normal(BLOCKS * 20) + 3.0 * courses.sum(axis=0)
+    channels = {
+        name: (30.0 + 5.0 * course, "degC")
+        for name, course in zip(("temperature", "temperature_2"), courses, strict=True)
+    }
+    examination = _examine(values, 1.0, channels, ("temperature_bias", "~red"))
+    evidence = selecting.score_candidates(examination, examination.start, ())
+    best = max(evidence, key=lambda item: item.evidence_nats.max())
+    assert best.candidate.effect == "~red"
+    chosen, _ = selecting._select_all(examination)
+    assert {selection.driver for selection in chosen} == {("temperature",), ("temperature_2",)}
+
+
 def test_an_effect_stays_beside_an_unidentified_burst():
     rng = np.random.default_rng(1)
     vibration = np.full(BLOCKS, 0.02)
@@ -94,10 +110,11 @@ def _explain(effect, statistic, evidence):
         ({"x": 50.0, "z": 7.0}, 60.0, []),  # not enough on the other axis alone
     ],
 )
-def test_a_drift_takes_only_what_it_explains_on_its_axis(jump_nats, on_x, remaining_axes):
+@pytest.mark.parametrize("name", ["~bias(t)", "~levels", "~red"])
+def test_a_drift_takes_only_what_it_explains_on_its_axis(jump_nats, on_x, remaining_axes, name):
     jump = make_selection(_explain("bias_jump", "mean", jump_nats), 8.0)
     jump = replace(jump, instead={"warm_up": jump.evidence_nats - 5.0})
-    parts = _explain("~bias(t)", "mean", {"x": on_x, "y": 201.0})
+    parts = _explain(name, "mean", {"x": on_x, "y": 201.0})
     drift = make_selection(parts, 8.0)
     remaining = _without_part_of_drift([jump], [drift], "x", 8.0)
     assert [identification.axes for identification in remaining] == remaining_axes

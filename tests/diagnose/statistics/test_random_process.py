@@ -1,4 +1,4 @@
-"""A random walk far beyond the calibrated one is no other effect on its axis."""
+"""A random walk far beyond the calibrated one is found as such."""
 
 from __future__ import annotations
 
