@@ -36,7 +36,7 @@ Array = NDArray[Any]
 #: that the means just show, of the first, and between two. Design choice: half decades, and 12 %.
 _WALK_DECADES = (0.0, 0.5)
 _FINE_DECADES = (-0.5, 0.05)
-_LAST_DECADE = 3.0  # of sizes, at least
+_LAST_DECADE = 3.0  # of sizes, where the means scatter less; design choice
 
 
 class RandomProcess(BlockMeanStatistic):
