@@ -259,10 +259,12 @@ def _group_columns(
             ((number, column) for number, column in numbered if column.rising < 0.9),
             key=lambda pair: pair[0],
         )
-        for place in range(0, len(digits) - 2, 3 if len(digits) % 3 == 0 else 1):
-            numbers, trio_columns = zip(*digits[place : place + 3], strict=True)
-            if numbers[2] - numbers[0] == 2:
-                yield template, dict(zip("xyz", trio_columns, strict=True))
+        axes = "xyz" if len(digits) > 2 else "xy"
+        step = 1 if len(digits) % len(axes) else len(axes)
+        for place in range(0, len(digits) - len(axes) + 1, step):
+            numbers, group = zip(*digits[place : place + len(axes)], strict=True)
+            if numbers[-1] - numbers[0] == len(axes) - 1:
+                yield template, dict(zip(axes, group, strict=True))
     for column in columns:
         if not column.key.isdigit():
             letter = re.search(r"[xyzXYZ](?![a-zA-Z])", column.key)

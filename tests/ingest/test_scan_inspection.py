@@ -100,6 +100,15 @@ LOGS: dict[str, tuple[Columns, bool, Sequence[NDArray[np.float64]], str]] = {
     "fine": (named("time,gx,gy,gz", [TIME, *FINE]), True, FINE, "deg/h"),
     "no time": (named("gx_dps,gy_dps,gz_dps", [GX, GY, GZ]), True, [GX, GY, GZ], "deg/s"),
     "one axis": (named("time [s],temp,yaw_rate_deg_s", [TIME, 20 + TIME, GX]), True, [GX], "deg/s"),
+    "two axes by number": (
+        named(
+            "time [s],FOG1 [deg/hr],FOG2 [deg/hr],T1 [degC],T2 [degC]",
+            [TIME, FINE[0], FINE[1], 20 + TIME, 21 + TIME],
+        ),
+        True,
+        FINE[:2],
+        "deg/h",
+    ),
     "no header": (
         named("0,1,2,3,4,5,6", [TIME, AX, AY, AZ, GX, GY, GZ]),
         False,
