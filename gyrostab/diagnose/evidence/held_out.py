@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
 from gyrostab.diagnose.evidence.products import (
-    WIDTHS,
     Array,
     Products,
     axis_noise,
@@ -35,6 +34,7 @@ from gyrostab.diagnose.evidence.products import (
     marginalise,
     mean_products,
     power_products,
+    prior_widths,
     remove_common_part,
 )
 from gyrostab.diagnose.evidence.wandering import RandomProcesses
@@ -112,14 +112,15 @@ def mean_factors(
     if wander is not None:
         setup["wander"] = wander
     white = mean_products(
-        values[:, :0],
+        values,
         columns,
         **(setup | {"K": np.zeros(1), "B": np.zeros(1)}),
         present=present,
     )
+    widths = prior_widths(white.square)
     raw_square = (columns[present] ** 2 / setup["variance"][present, None]).sum(axis=0)
     errors = factor_errors(raw_square, np.diagonal(white.gram[0]))[design_width:]
-    precision = np.diag(1.0 / np.square(np.where(errors > 0.0, errors, 1.0) * WIDTHS[-1]))
+    precision = np.diag(1.0 / np.square(np.where(errors > 0.0, errors, 1.0) * widths[-1]))
     without_given = marginalise(white, columns_given.shape[1], precision)
     limits = factor_errors(raw_square[:design_width], np.diagonal(without_given.gram[0]))
     log_weight = noise_weight(baseline, axis, tier)
@@ -127,7 +128,7 @@ def mean_factors(
     by_subset = (
         mean_products(values, columns, **setup, present=present & subset) for subset in subsets
     )
-    return _factors_by_subset(by_subset, precision, numbers, limits, log_weight)
+    return _factors_by_subset(by_subset, precision, numbers, limits, log_weight, widths)
 
 
 def _factors_by_subset(
@@ -136,6 +137,7 @@ def _factors_by_subset(
     designs: Sequence[NDArray[np.int64]],
     limits: Array,
     log_weight: Array,
+    widths: Array,
     is_bounded: Sequence[bool] = (),
 ) -> Array:
     """Return the factors of designs from products, whose last columns have this prior precision."""
@@ -146,6 +148,7 @@ def _factors_by_subset(
                 designs,
                 limits,
                 log_weight,
+                widths,
                 is_bounded,
             )
             for part in by_subset
@@ -238,7 +241,8 @@ def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
     total = _sum_products(products)
     design_width = columns.shape[2] - count
     raw_square = np.asarray(np.diagonal(total.gram[0]))
-    precision = _fill_free_precision(model.precision, raw_square[design_width:])
+    widths = prior_widths(total.square)
+    precision = _fill_free_precision(model.precision, raw_square[design_width:], widths[-1])
     without_given = marginalise(total, count, precision)
     limits = factor_errors(raw_square[:design_width], np.diagonal(without_given.gram[0]))
     subset_products = [total]
@@ -248,7 +252,7 @@ def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
             held = _sum_products([part for part, is_held in of_fold if is_held])
             subset_products.append(Products(*(a - b for a, b in zip(total, held, strict=True))))
     return _factors_by_subset(
-        subset_products, precision, numbers, limits, np.zeros(1), model.is_bounded
+        subset_products, precision, numbers, limits, np.zeros(1), widths, model.is_bounded
     )
 
 
@@ -256,8 +260,8 @@ def _sum_products(products: Sequence[Products]) -> Products:
     return Products(*(reduce(np.add, arrays) for arrays in zip(*products, strict=True)))
 
 
-def _fill_free_precision(precision: Array, square: Array) -> Array:
-    """Return precisions of given columns, negative ones replaced by the widest prior."""
+def _fill_free_precision(precision: Array, square: Array, width: float) -> Array:
+    """Return precisions of given columns, negative ones replaced by a prior of this width."""
     diagonal = np.diagonal(precision)
-    free = np.where(square > 0.0, square, 1.0) / WIDTHS[-1] ** 2
+    free = np.where(square > 0.0, square, 1.0) / width**2
     return np.diag(np.where(diagonal < 0.0, free, diagonal))

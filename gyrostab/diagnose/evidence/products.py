@@ -21,6 +21,9 @@ Array = NDArray[np.float64]
 #: Standard deviations of the prior of a factor, in units of its error in white noise. Design
 #: choice: a mixture over three decades needs no prior size.
 WIDTHS = (1.0, 10.0, 100.0, 1000.0)
+#: Largest width for stronger data. Design choice: given columns that are nearly the same are still
+#: separated by more than rounding errors.
+_MAX_WIDTH = 1e6
 #: A design that keeps a smaller share of its square, after constants and given columns are
 #: projected out, counts as absent. Above rounding errors.
 _MIN_SQUARE_SHARE = 1e-9
@@ -34,6 +37,18 @@ class Products(NamedTuple):
     cross: Array  # (grid, column, record): x' y
     gram: Array  # (grid, column, column): x' x
     log_determinant: Array  # (grid,): of the covariance
+
+
+def prior_widths(square: Array) -> Array:
+    """Return `WIDTHS`, with the last one as large as any factor of data with these squares can be.
+
+    Examples
+    --------
+    >>> prior_widths(np.array([100.0])), prior_widths(np.array([100.0, 1e10]))
+    (array([   1.,   10.,  100., 1000.]), array([1.e+00, 1.e+01, 1.e+02, 1.e+05]))
+    """
+    largest = np.sqrt(np.max(square, initial=0.0))
+    return np.array([*WIDTHS[:-1], np.clip(largest, WIDTHS[-1], _MAX_WIDTH)])
 
 
 def marginalise(products: Products, given: int, precision: Array) -> Products:
@@ -201,13 +216,14 @@ def log_evidence(
     designs: Sequence[NDArray[np.int64]],
     limits: Array,
     log_weight: Array,
+    widths: Array,
     is_bounded: Sequence[bool] = (),
 ) -> Array:
     """Compute the log marginal likelihood without any design, and with each, (1 + design, record).
 
     A design is the indices of its columns, and may have factors that cannot be negative. The limits
     (column,) are the errors of the factors in white noise, 0 for columns without effect. The log
-    weights of the grid points (grid,) are not normalised.
+    weights of the grid points (grid,) are not normalised. The widths are those of `prior_widths`.
     """
     bounded = np.array(is_bounded, np.bool_) if len(is_bounded) else np.zeros(len(designs), bool)
     weight = log_weight - np.logaddexp.reduce(log_weight)
@@ -217,25 +233,31 @@ def log_evidence(
     out = np.empty((1 + len(designs), base.shape[0]))
     out[0] = np.logaddexp.reduce(base, axis=1)
     at_once = max(1, _MAX_PRODUCTS_AT_ONCE // max(base.size, 1))
-    widths = np.array([chosen.size for chosen in designs], np.int64)
-    for width, bound in sorted({*zip(widths.tolist(), bounded.tolist(), strict=True)}):
-        same_kind = np.flatnonzero((widths == width) & (bounded == bound)).tolist()
+    sizes = np.array([chosen.size for chosen in designs], np.int64)
+    for size, bound in sorted({*zip(sizes.tolist(), bounded.tolist(), strict=True)}):
+        same_kind = np.flatnonzero((sizes == size) & (bounded == bound)).tolist()
         for first in range(0, len(same_kind), at_once):
             batch = same_kind[first : first + at_once]
-            out[1 + np.array(batch)] = _equal_width_evidence(
-                products, np.stack([designs[number] for number in batch]), limits, base, bound
+            out[1 + np.array(batch)] = _equal_size_evidence(
+                products,
+                np.stack([designs[number] for number in batch]),
+                limits,
+                base,
+                widths,
+                bound,
             )
     return out
 
 
-def _equal_width_evidence(
+def _equal_size_evidence(
     products: Products,
     chosen: NDArray[np.int64],
     limits: Array,
     base: Array,
+    widths: Array,
     is_bounded: bool,
 ) -> Array:
-    """Compute log marginal likelihoods (design, record) of equal-width designs (design, column)."""
+    """Compute log marginal likelihoods (design, record) of designs (design, column)."""
     scale = limits[chosen]
     gram = products.gram[:, chosen[:, :, None], chosen[:, None, :]] * (
         scale[:, :, None] * scale[:, None, :]
@@ -248,16 +270,18 @@ def _equal_width_evidence(
         rotated = vectors.swapaxes(2, 3) @ rotated
     squares = np.maximum(eigenvalues, 0.0)
     if is_bounded:
-        return _bounded_evidence(base, rotated, squares, vectors)
+        return _bounded_evidence(base, rotated, squares, vectors, widths)
     return mixed_evidence(
         base,
         np.ascontiguousarray(rotated.transpose(1, 3, 0, 2)),
         np.ascontiguousarray(squares.swapaxes(0, 1)),
-        np.square(WIDTHS),
+        np.square(widths),
     )
 
 
-def _bounded_evidence(base: Array, rotated: Array, eigenvalues: Array, vectors: Array) -> Array:
+def _bounded_evidence(
+    base: Array, rotated: Array, eigenvalues: Array, vectors: Array, widths: Array
+) -> Array:
     """Compute the log marginal likelihoods (design, record) of factors that cannot be negative.
 
     Their prior is the positive half of the normal one. The likelihood changes by the share of the
@@ -266,7 +290,7 @@ def _bounded_evidence(base: Array, rotated: Array, eigenvalues: Array, vectors: 
     `rotated` (grid, design, column, record) is ``x' y`` in the frame of the eigenvectors of ``x'
     x``, whose eigenvalues are (grid, design, column); `base` is (record, grid).
     """
-    width = np.square(WIDTHS)[:, None, None, None]
+    width = np.square(widths)[:, None, None, None]
     spread = 1.0 + width * eigenvalues
     variance = width / spread  # (width, grid, design, column) of the posterior
     mean = vectors @ (variance[..., None] * rotated)
@@ -278,7 +302,7 @@ def _bounded_evidence(base: Array, rotated: Array, eigenvalues: Array, vectors: 
         + (log_ndtr(mean / sd[..., None]) + np.log(2.0)).sum(axis=3)
     )
     joined = terms.reshape(-1, *terms.shape[2:])
-    return np.asarray(np.logaddexp.reduce(joined, axis=0) - np.log(len(WIDTHS)))
+    return np.asarray(np.logaddexp.reduce(joined, axis=0) - np.log(widths.size))
 
 
 def held_out_evidence(

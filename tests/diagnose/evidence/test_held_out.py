@@ -302,6 +302,19 @@ def test_units_of_a_design_do_not_matter():
     np.testing.assert_allclose(plain, scaled, atol=1e-7)
 
 
+def test_motion_far_beyond_the_noise_is_explained_as_a_whole():
+    """With a factor of 100 000 standard errors, the means are as likely as those at rest."""
+    data, baseline = mean_case(80, records=1)
+    motion = np.repeat(np.random.default_rng(4).standard_normal(20), 4)
+    moved = data.assign(mean=data["mean"] + 1e3 * xr.DataArray(motion, dims="block"))
+    at_rest = mean_factors(data, baseline, [], axis="x")[0, 0, 0]
+    without, gain = mean_factors(moved, baseline, [motion], axis="x")[0, :, 0]
+    given = mean_factors(moved, baseline, [], axis="x", given=motion[:, None])[0, 0, 0]
+    assert without < at_rest - 1000.0
+    assert without + gain == pytest.approx(at_rest, abs=20.0)
+    assert given == pytest.approx(at_rest, abs=20.0)
+
+
 def test_folds_are_interleaved_and_scale_with_the_record():
     blocks = xr.Dataset(coords={name: value for name, value in frame(180).items()})
     fold = fold_blocks(blocks)

@@ -32,13 +32,21 @@ def test_evidence_does_not_need_products_of_unrelated_columns():
     assert selected.gram[0, 0, 1] == 0.0 != whole.gram[0, 0, 1]
     expected, got = (
         log_evidence(
-            marginalise(products, 1, np.eye(1)), numbers, np.full(6, 0.2), np.array([-1.0, -2.0])
+            marginalise(products, 1, np.eye(1)),
+            numbers,
+            np.full(6, 0.2),
+            np.array([-1.0, -2.0]),
+            np.array(WIDTHS),
         )
         for products in (whole, selected)
     )
     np.testing.assert_allclose(got, expected, rtol=1e-12)
     separate = log_evidence(
-        marginalise(whole, 1, np.eye(1)), numbers[3:], np.full(6, 0.2), np.array([-1.0, -2.0])
+        marginalise(whole, 1, np.eye(1)),
+        numbers[3:],
+        np.full(6, 0.2),
+        np.array([-1.0, -2.0]),
+        np.array(WIDTHS),
     )
     np.testing.assert_allclose(separate[1], got[4], rtol=1e-12)
 
@@ -50,7 +58,9 @@ def test_evidence_of_a_size_that_cannot_be_negative_is_that_of_half_a_prior():
     for size in (-1.0, -0.1, 0.0, 0.5):
         values = size * column + rng.standard_normal(40)
         products = power_products(values[:, None], weight, column[:, None])
-        without, got = log_evidence(products, [np.arange(1)], limits, np.zeros(1), [True])[:, 0]
+        without, got = log_evidence(
+            products, [np.arange(1)], limits, np.zeros(1), np.array(WIDTHS), [True]
+        )[:, 0]
 
         def integrand(factor: float, sd: float, values=values) -> float:
             misfit = values @ values - np.square(values - factor * column).sum()
@@ -75,10 +85,10 @@ def test_evidence_of_two_sizes_that_cannot_be_negative_is_close_to_that_of_the_p
     columns = np.stack([np.ones(200), np.linspace(0.0, 2.0, 200)], axis=1)
     values = columns @ [3.0, -1.2] + rng.standard_normal(200)
     products = power_products(values[:, None], np.ones(200), columns)
-    limits = 1.0 / np.linalg.norm(columns, axis=0)
+    limits, widths = 1.0 / np.linalg.norm(columns, axis=0), np.array(WIDTHS)
     designs = [np.arange(2), np.arange(1)]
-    any_sign = log_evidence(products, designs, limits, np.zeros(1))[:, 0]
-    positive = log_evidence(products, designs, limits, np.zeros(1), [True, True])[:, 0]
+    any_sign = log_evidence(products, designs, limits, np.zeros(1), widths)[:, 0]
+    positive = log_evidence(products, designs, limits, np.zeros(1), widths, [True, True])[:, 0]
     assert any_sign[1] > any_sign[2] + 20.0
     assert positive[1] < positive[2]
     assert positive[1] > positive[2] - 10.0
