@@ -83,12 +83,16 @@ class RandomProcess(BlockMeanStatistic):
                 factors = np.stack(
                     [
                         np.logaddexp.reduce(by_size, axis=0) - np.log(len(by_size))
-                        for by_size in of_sizes
+                        for _, by_size in of_sizes
                     ]
                 )
                 factors = factors + np.log(prior / prior.sum())[:, None]
                 evidence_nats.append(np.logaddexp.reduce(factors, axis=0))
-                best.append(_plain_or_best(candidate, factors[:, 0], trial.state.settings))
+                variant = _plain_or_best(candidate, factors[:, 0], trial.state.settings)
+                if not candidate.driver:
+                    size, _ = _average_size(*of_sizes[0])
+                    variant = replace(variant, design=size**2 * variant.design)
+                best.append(variant)
             rows = self.rows(candidate, trial.state)
             out.append(
                 CandidateEvidence(candidate, rows, np.stack(evidence_nats, axis=-1), tuple(best))
@@ -96,9 +100,15 @@ class RandomProcess(BlockMeanStatistic):
         return out
 
     def condition(self, state: State, component: Component) -> State:
-        """Put a random walk that follows a channel into the noise of the means."""
-        size, _ = _walk_size(component, state, component.variant)
-        walk = size**2 * component.variant.design[0]
+        """Put a random walk into the noise of the means.
+
+        A steady one keeps the size that it was found with: without another effect of that time, it
+        would take the course of this effect as well, and leave it nothing.
+        """
+        walk = component.variant.design[0]
+        if component.candidate.driver:
+            size, _ = _walk_size(component, state, component.variant)
+            walk = size**2 * walk
         return replace(state, baseline=with_process(state.baseline, component.row[0], walk))
 
     def estimate(self, fit: SizeFit) -> Sizes:
@@ -128,10 +138,10 @@ def _plain_or_best(candidate: Candidate, evidence_nats: Array, settings: Setting
     return candidate.variants[plain[0] if plain else best]
 
 
-def _factors_by_variant(candidate: Candidate, axis: str, trial: Trial) -> list[Array]:
-    """Return the factors of each variant, (size, record)."""
+def _factors_by_variant(candidate: Candidate, axis: str, trial: Trial) -> list[tuple[Array, Array]]:
+    """Return the sizes (size,) and factors (size, record) of each variant."""
     return [
-        _walk_factors(variant, axis, trial.data, trial.state, _WALK_DECADES)[1]
+        _walk_factors(variant, axis, trial.data, trial.state, _WALK_DECADES)
         for variant in candidate.variants
     ]
 
@@ -184,6 +194,11 @@ def _walk_size(component: Component, state: State, variant: Variant) -> tuple[fl
     sizes, factors = _walk_factors(
         variant, component.row[0], state.blocks, state, _FINE_DECADES, tier="calibrated"
     )
+    return _average_size(sizes, factors)
+
+
+def _average_size(sizes: Array, factors: Array) -> tuple[float, float]:
+    """Return mean and standard deviation of a size (size,) by its factors (size, record)."""
     weight = np.exp(factors[:, 0] - np.logaddexp.reduce(factors[:, 0]))
     mean = float(weight @ sizes)
     return mean, float(np.sqrt(weight @ (sizes - mean) ** 2))

@@ -169,8 +169,8 @@ def test_axis_that_turns_without_a_channel_leaks_into_another():
     assert "z" in {axis for unknown in identifications.unknown for axis in unknown.axes}
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("error", [0.0, 2e-4])
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [0.0, pytest.param(2e-4, marks=pytest.mark.full)])
 def test_whole_rotation_is_the_only_effect(error: float):
     diagnosis = diagnose(_log_whole_rotation(2, error=error), nulls=100)
     (effect,) = diagnosis.effects
