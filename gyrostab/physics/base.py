@@ -312,9 +312,9 @@ class Effect:
         values
             By stage: "motion" and "rate": contribution to the rate [degree hour-1], shape (axes,
             size) or (size,). "noise": mapping of changed symbols to squared coefficients, from
-            `Chunk.level`. "sensor", "electronics", "logger": the resulting signal, shape (axes,
-            size). "sampling": the same, or ``size / oversampling`` samples where the effect
-            decimates.
+            `Chunk.level`; its item "rate" is noise of another spectrum [degree hour-1]. "sensor",
+            "electronics", "logger": the resulting signal, shape (axes, size). "sampling": the same,
+            or ``size / oversampling`` samples where the effect decimates.
         state
         """
         raise NotImplementedError

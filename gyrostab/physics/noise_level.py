@@ -10,18 +10,33 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import sampled_psd
-from gyrostab.physics.base import Array, Chunk, Effect, Likeness, Prediction, Windows, parameter
+from gyrostab.physics.base import (
+    Array,
+    Chunk,
+    Effect,
+    Likeness,
+    Prediction,
+    Setup,
+    Windows,
+    parameter,
+)
 from gyrostab.units import HOUR, INNER
 
 #: Least N^2 of a polynomial law, as a share of its value at the reference (a tenth of N). Outside
 #: of the range where it was measured, the polynomial could be negative.
 LEAST_SHARE = 0.01
+#: Resonances of a mount that are tried, as shares of the sampling rate, and their qualities. The
+#: bands of a spectrum, each 1.5 times as wide as the one below, do not resolve more.
+_RESONANCE_SHARES = (0.045, 0.08, 0.14, 0.25, 0.45)
+_RESONANCE_QUALITIES = (1.0, 4.0)
+#: Multiple of a resonance above which less than 1e-4 of the density of a rigid mount is left.
+_MOUNT_BAND = 10.0
 
 
 def _raise_noise(effect: Effect, chunk: Chunk, share: Array) -> dict[str, Array]:
@@ -259,9 +274,11 @@ class VibrationNoise(_FollowsVibration):
     """Noise level that follows the vibration: angle random walk, and noise of the angle.
 
     ``N^2(t) = N0^2 + s_N^2 g^2p``, ``Q^2(t) = Q0^2 + s_Q^2 g^2p``, g the rms acceleration in units
-    of 1 g, p the exponent
+    of 1 g, p the exponent. With `resonance`, the added white noise passes a mount, a mass on a
+    spring: its density at the frequency f is ``s_N^2 g^2p f0^4 / ((f^2 - f0^2)^2 + (f f0 / q)^2)``,
+    f0 the resonance and q its quality. A sample is the mean over its interval.
 
-    For noise in a band, resonant or aliased, see aliased_vibration.
+    For noise above half of the sampling rate, see aliased_vibration.
 
     References
     ----------
@@ -299,11 +316,76 @@ class VibrationNoise(_FollowsVibration):
     quantization: float = parameter(
         "urad/g", "added Q, in squares, per rms g", default=0.0, typical=5.0, low=0.0, high=1e6
     )
+    resonance: float = parameter(
+        "Hz", "resonance of the mount; 0 for a rigid one", default=0.0, low=0.0, high=1e5
+    )
+    quality: float = parameter("1", "quality of that resonance", default=1.0, low=0.5, high=1000.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.resonance and self.quantization:
+            raise OptionError(
+                f"effect {self.name!r}: a mount (resonance = {self.resonance:g} Hz) filters white "
+                "noise only; give the quantization in another effect of this name"
+            )
+
+    @classmethod
+    def example(cls, **values: Any) -> Self:
+        """Make the effect with its typical sizes; of white noise only with a resonance."""
+        return super().example(**{"quantization": 0.0} if values.get("resonance") else {}, **values)
+
+    def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
+        """Begin independent noise behind the mount on each axis."""
+        if not self.resonance:
+            return None
+        from gyrostab.kernels.random.coloured import begin_process, mount
+
+        reading = mount(self.resonance, self.quality, setup.rate)
+        return [begin_process(reading, own) for own in rng.spawn(len(setup.axes))]
+
+    def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
+        if not self.resonance:
+            return super().generate(chunk, state)
+        from gyrostab.kernels.random.coloured import read_process
+
+        noise, state = zip(*(read_process(process, chunk.size) for process in state), strict=True)
+        size = self.white * math.sqrt(HOUR) * np.sqrt(self._raise_to_power(chunk.drivers))
+        return {"rate": size * np.stack(noise)}, state
+
+    def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
+        """List exponents with a rigid mount, and with resonances in the band of the log."""
+        mounts = [(0.0, 1.0)] + [
+            (share * windows.rate, quality)
+            for share in _RESONANCE_SHARES
+            for quality in _RESONANCE_QUALITIES
+        ]
+        return [
+            {"exponent": float(exponent), "resonance": resonance, "quality": quality}
+            for exponent in self.nuisance(windows)["exponent"]
+            for resonance, quality in mounts
+        ]
+
+    def explain(self, windows: Windows) -> Prediction:
+        """Predict the added spectra of independent noise on each axis."""
+        if not self.resonance:
+            return super().explain(windows)
+        from gyrostab.kernels.random.coloured import folded_psd, mount_psd
+
+        def density(f: Array) -> Array:
+            return mount_psd(f, self.resonance, self.quality)
+
+        highest = max(windows.rate, _MOUNT_BAND * self.resonance)
+        folded = folded_psd(density, windows.frequency, windows.rate, highest, average=True)
+        excited = self._raise_to_power(windows.drivers)[:, None]
+        return Prediction(spectrum={"white": excited * HOUR * folded})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         laws = self.laws
         terms = [f"{self.quantity(name, errors)} of {laws[name]}" for name in self.list_sizes()]
         size = " and ".join(terms) or "nothing"
+        if self.resonance:
+            at = self.quantity("resonance", errors)
+            size += f" through a mount with a resonance at {at}"
         return f"Vibration raises the noise {self.on_axes()}: {size}, {self._describe_law(errors)}."
 
 

@@ -162,6 +162,7 @@ def _add_noise(
 ) -> Array:
     """True rate and noise, with the noise at the level that the effects give it."""
     size = units[0].size
+    signal = np.stack([true[axis] + bias for axis, bias in zip(plan.axes, plan.bias, strict=True)])
     levels = [
         {
             term: np.full(size, value**2) if numbers else value**2
@@ -180,8 +181,10 @@ def _add_noise(
             for row, row_values in zip(
                 step.rows, np.broadcast_to(values, (len(rows), size)), strict=True
             ):
-                levels[row][term] = row_values
-    signal = np.empty((len(plan.axes), size))
+                if term == "rate":
+                    signal[row] += row_values
+                else:
+                    levels[row][term] = row_values
     for row, axis in enumerate(plan.axes):
         noise, state.noise[axis] = shape(
             units[row],
@@ -190,7 +193,7 @@ def _add_noise(
             state.noise.get(axis, {}),
             ramp=plan.coefficients[row]["R"],
         )
-        signal[row] = noise + (true[axis] + plan.bias[row])
+        signal[row] += noise
     return signal
 
 

@@ -135,6 +135,7 @@ VARIANTS = [
     {"name": "thermal_gradient", "sensitivity": 0.05, "change": 0.2},
     {"name": "thermal_hysteresis", "sensitivity": 0.01, "width": 0.5},
     {"name": "vibration_noise", "white": 0.02, "quantization": 2.0, "exponent": 0.9},
+    {"name": "vibration_noise", "white": 0.02, "resonance": 3.0, "quality": 4.0},
     {"name": "vibration_random_walk", "sensitivity": 0.7, "exponent": 1.3},
     {"name": "warm_up", "amplitude": 0.3, "slow_amplitude": 0.1, "gap": 2.0, "cooling": 30},
 ]  # fmt: skip

@@ -6,10 +6,12 @@ import math
 
 import numpy as np
 import pytest
+from scipy.signal import welch
 
 from gyrostab.allan.davar import davar
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import LAWS
+from gyrostab.physics.base import Windows
 from gyrostab.physics.registry import effects, make_effect
 from gyrostab.simulate import simulate
 from tests.support.effect_bench import avar, build_effect, run, steady
@@ -177,6 +179,44 @@ def test_vibration_adds_noise_of_the_angle_with_its_slope():
     surface = davar(log, window="300s", step="300s", taus=[0.02, 0.1, 0.5]).isel(time=1)
     expected = LAWS["Q"].avar(surface.tau.values, 5.0 * math.sqrt(4.0))
     np.testing.assert_allclose(surface.avar.values, np.tile(expected, (2, 1)), rtol=0.08)
+
+
+def test_white_noise_under_vibration_passes_the_mount():
+    """The density is that of N at low frequency, and q^2 of it at the resonance; axes differ."""
+    table = {"name": "vibration_noise", "white": 0.01, "resonance": 5.0, "quality": 4.0}
+    log = shaken(table, noise={"N": 1e-6}, rate=100)
+    at_rest, rates = log.rate.values[:, :30_000], log.rate.values[:, 30_000:60_000]
+    assert at_rest.std() == pytest.approx(1e-6 * 60.0 * 10.0, rel=0.02)
+    frequency, density = welch(rates, 100.0, nperseg=1000)
+    ratio = density.mean(axis=0) / 2.0 / (0.01 * 4.0 * 60.0) ** 2
+    low, peak, high = (ratio[np.abs(frequency - f) < 0.25].mean() for f in (0.5, 5.0, 15.0))
+    assert low == pytest.approx(1.0, rel=0.15)
+    assert peak == pytest.approx(16.0, rel=0.15)
+    assert high == pytest.approx(1.0 / 64.0, rel=0.15)
+    assert abs(np.corrcoef(rates)[0, 1]) < 0.1
+
+
+def test_a_mount_is_predicted_as_it_is_generated():
+    effect = build_effect("vibration_noise", white=0.01, resonance=30.0, quality=2.0)
+    rates = run(effect, size=200_000, rate=100.0, axes=("x",), drivers={"vibration": 2.0})["rate"]
+    frequency, density = welch(rates[0], 100.0, nperseg=256)
+    windows = Windows(
+        begin=np.zeros(1),
+        end=np.ones(1),
+        frequency=frequency[2:-2],
+        rate=100.0,
+        axes=("x",),
+        drivers={"vibration": np.array([2.0])},
+    )
+    expected = 0.01**2 * effect.explain(windows).spectrum["white"][0]
+    np.testing.assert_allclose(density[2:-2] / 2.0, expected, rtol=0.15)
+
+
+def test_a_mount_does_not_filter_quantization():
+    with pytest.raises(
+        OptionError, match=r"a mount \(resonance = 30 Hz\) filters white noise only"
+    ):
+        build_effect("vibration_noise", white=0.01, quantization=1.0, resonance=30.0)
 
 
 def test_random_walk_persists_where_rectification_reverts():

@@ -11,7 +11,15 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from gyrostab.allan.davar import davar
 from gyrostab.errors import OptionError
-from gyrostab.kernels.random.coloured import band, band_psd, folded_psd, oscillator, oscillator_psd
+from gyrostab.kernels.random.coloured import (
+    band,
+    band_psd,
+    folded_psd,
+    mount,
+    mount_psd,
+    oscillator,
+    oscillator_psd,
+)
 from gyrostab.physics.base import Windows
 from gyrostab.physics.registry import effects
 from gyrostab.simulate import simulate
@@ -38,13 +46,13 @@ def density_of_reading(reading, f, rate):
 @pytest.mark.parametrize("average", [False, True], ids=["point", "average"])
 @pytest.mark.parametrize("rate", [7.0, 400.0, 1900.0, 30_000.0])
 @pytest.mark.parametrize(
-    "mount", [{}, {"resonance": 620.0, "quality": 8.0}], ids=["rigid", "mount"]
+    "spring", [{}, {"resonance": 620.0, "quality": 8.0}], ids=["rigid", "mount"]
 )
-def test_samples_of_a_band_have_its_folded_density(mount, rate, average):
-    reading = band(700.0, 800.0, rate, **mount, average=average)
+def test_samples_of_a_band_have_its_folded_density(spring, rate, average):
+    reading = band(700.0, 800.0, rate, **spring, average=average)
     f = np.linspace(0.02, 0.48, 12) * rate
     expected = folded_psd(
-        lambda g: band_psd(g, 700.0, 800.0, **mount), f, rate, 20_000.0, average=average
+        lambda g: band_psd(g, 700.0, 800.0, **spring), f, rate, 20_000.0, average=average
     )
     density_of_samples = density_of_reading(reading, f, rate)
     strong = expected > 1e-6 * expected.max()
@@ -77,6 +85,24 @@ def test_samples_of_an_oscillator_have_its_folded_density(frequency, quality, ra
         lambda g: oscillator_psd(g, frequency, quality), f, rate, 1e5, average=average
     )
     np.testing.assert_allclose(density_of_reading(reading, f, rate), expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize("average", [False, True], ids=["point", "average"])
+@pytest.mark.parametrize(
+    ("resonance", "quality", "rate"),
+    [(30.0, 12.0, 100.0), (30.0, 0.7, 400.0), (270.0, 3.0, 100.0), (1e-4, 0.7, 100.0)],
+)
+def test_samples_behind_a_mount_have_its_folded_density(resonance, quality, rate, average):
+    reading = mount(resonance, quality, rate, average=average)
+    f = np.linspace(0.02, 0.48, 15) * rate
+    expected = folded_psd(lambda g: mount_psd(g, resonance, quality), f, rate, 1e5, average=average)
+    np.testing.assert_allclose(density_of_reading(reading, f, rate), expected, rtol=2e-3)
+
+
+def test_a_mount_has_no_gain_at_rest_and_its_quality_at_the_resonance():
+    np.testing.assert_allclose(
+        mount_psd(np.array([0.0, 50.0, 5000.0]), 50.0, 6.0), [1.0, 36.0, 1e-8], rtol=1e-3
+    )
 
 
 def test_a_slow_process_has_no_noise_far_above_it():

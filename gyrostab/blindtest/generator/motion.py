@@ -125,7 +125,7 @@ def _make_shaking_noise(
         parameters["white"] = {
             "values": white,
             "unit": "deg/sqrt(h)/g",
-            "unless": ["quantization", "exponent"],
+            "unless": ["quantization", "exponent", "resonance"],
         }
     return replace(effect, extra=extra, parameters=parameters)
 

@@ -149,6 +149,26 @@ def oscillator(frequency: float, quality: float, rate: float, *, average: bool =
     return _make_reading(a, b, np.eye(2), c, rate, average=average)
 
 
+def mount(resonance: float, quality: float, rate: float, *, average: bool = True) -> Reading:
+    """Describe white noise of density 1 Hz-1 behind a mass on a spring, whose gain is one at rest.
+
+    Parameters
+    ----------
+    resonance : float
+        Undamped frequency [Hz].
+    quality : float
+        Gain at that frequency.
+    rate : float
+        Sampling rate [Hz].
+    average : bool
+        Read the mean over each sample instead of the value at its beginning.
+    """
+    omega = 2.0 * math.pi * resonance
+    a, b, c = _chain_sections([_Section(omega, omega / quality, False)])
+    covariance = solve_continuous_lyapunov(a, -np.outer(b, b))
+    return _make_reading(a, b, covariance, c, rate, average=average)
+
+
 def _band_sections(low: float, high: float) -> list[_Section]:
     """Make a Butterworth band-pass with half power at `low` and `high` [Hz]."""
     width, centre = 2.0 * math.pi * (high - low), 2.0 * math.pi * math.sqrt(low * high)
@@ -271,10 +291,13 @@ def band_psd(
     share = math.pi / (2 * ORDER)
     density = 0.5 / ((high - low) * share / math.sin(share)) / (1.0 + x ** (2 * ORDER))
     if resonance:
-        density = (
-            density * resonance**4 / ((f**2 - resonance**2) ** 2 + (f * resonance / quality) ** 2)
-        )
+        density = density * mount_psd(f, resonance, quality)
     return np.asarray(density)
+
+
+def mount_psd(f: Array, resonance: float, quality: float) -> Array:
+    """Compute the two-sided density [Hz-1] of `mount` in continuous time."""
+    return np.asarray(resonance**4 / ((f**2 - resonance**2) ** 2 + (f * resonance / quality) ** 2))
 
 
 def folded_psd(

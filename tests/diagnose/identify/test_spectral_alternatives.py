@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from scipy.signal import butter, sosfilt
+from scipy.signal import bilinear, butter, lfilter, sosfilt
 
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.verdict import name_probability
@@ -14,6 +14,7 @@ from gyrostab.ingest.make_log import make_log
 from tests.support.named import name_effects, nulls
 
 RATE, SECONDS = 20.0, 1200
+RESONANCE_HZ = 2.8
 
 
 def shaken_record(kind: str, *, seed: int = 5) -> xr.Dataset:
@@ -24,6 +25,10 @@ def shaken_record(kind: str, *, seed: int = 5) -> xr.Dataset:
     added = rng.standard_normal(size)
     if kind == "rising":  # N and Q
         added = 0.5 * added + np.diff(rng.standard_normal(size + 1))
+    elif kind == "mount":
+        omega = 2.0 * np.pi * RESONANCE_HZ
+        mount = lfilter(*bilinear([omega**2], [1.0, omega / 4.0, omega**2], fs=RATE), added)
+        added = 0.4 * mount
     else:
         hump = sosfilt(butter(2, [2.0, 4.0], "bandpass", fs=RATE, output="sos"), added)
         added = hump / hump.std()
@@ -36,7 +41,7 @@ def shaken_record(kind: str, *, seed: int = 5) -> xr.Dataset:
 
 @pytest.mark.parametrize(
     ("kind", "is_separated"),
-    [pytest.param("rising", True, marks=pytest.mark.slow), ("hump", False)],
+    [pytest.param("rising", True, marks=pytest.mark.slow), ("mount", True), ("hump", False)],
 )
 def test_vibration_noise_is_alone_only_if_its_spectrum_fits(kind: str, is_separated: bool) -> None:
     blocks = shaken_record(kind)
@@ -48,5 +53,8 @@ def test_vibration_noise_is_alone_only_if_its_spectrum_fits(kind: str, is_separa
     assert set(identification.alternatives) == (
         set() if is_separated else names - {identification.effect}
     )
+    if kind == "mount":
+        resonance = identification.components[0].variant.values["resonance"]
+        assert resonance == pytest.approx(RESONANCE_HZ, rel=0.4)
     share = 1.0 if is_separated else 1.0 / (1.0 + DEFAULTS.alternative_weight)
     assert name_probability(identification) == pytest.approx(share * DEFAULTS.set_probability)
