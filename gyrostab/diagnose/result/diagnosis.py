@@ -89,7 +89,7 @@ class Diagnosis:
             if others and has_family:
                 lines.append(f"  {family_text(effect, others)}")
             lines.append(
-                f"  evidence: held-out data are predicted better by {evidence['nats']:.3g} nats "
+                f"  evidence: {evidence['nats']:.3g} nats "
                 f"(threshold against chance: {evidence['threshold']:.2g} nats)"
             )
             if sure := probability_text(effect):
