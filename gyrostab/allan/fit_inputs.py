@@ -16,7 +16,7 @@ from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.fit.covariance import STOCHASTIC
 from gyrostab.noise import TERMS
 from gyrostab.schema import check_surface
-from gyrostab.time.durations import duration_seconds
+from gyrostab.time.durations import PRINTED_DIGITS, duration_seconds
 from gyrostab.units import HOUR
 
 #: Variables of a surface that a fit uses: by averaging time, and those of the trend by window.
@@ -81,7 +81,9 @@ def check_options(
     if surface.attrs.get("variance") == "hadamard" and fitted_terms == ["R"]:
         raise OptionError("terms 'R': the Hadamard variance does not see a ramp")
     tau = surface["tau"].values
-    chosen = np.flatnonzero((tau >= low * (1 - 1e-9)) & (tau <= high * (1 + 1e-9)))
+    chosen = np.flatnonzero(
+        (tau >= low * (1 - PRINTED_DIGITS)) & (tau <= high * (1 + PRINTED_DIGITS))
+    )
     if chosen.size == 0:
         limits = [f"from {low:g} s on"] * (low > 0) + [f"up to {high:g} s"] * (high < np.inf)
         raise OptionError(

@@ -224,6 +224,8 @@ def _choose_lags(max_lag: Any, span: float, step: float) -> NDArray[np.int64]:
 def _usable_series(product: xr.Dataset, name: str, axis: int) -> Array:
     """Return a variable by window, NaN where it is not observed or almost no sample is present."""
     part = product.isel(axis=axis)
+    if name == "window_coverage":
+        return np.asarray(part[name].values, np.float64)
     good = part["window_coverage"].values > _MIN_COVERAGE
     if name in TERMS:
         good &= part["observable"].sel(term=name).values == OBSERVED

@@ -79,9 +79,7 @@ def assemble(
     for driver in drivers:
         attributes = {"long_name": f"{driver.label}, mean of the window", "units": driver.units}
         made[driver.name] = (
-            product[driver.name]
-            if driver.name in product.data_vars
-            else ("time", driver.values[0], attributes)
+            product[driver.name] if driver.of_product else ("time", driver.values[0], attributes)
         )
     for name, (key, label, units) in _STATISTICS.items():
         made[name] = (dims, table(key), {"long_name": label, "units": units})
@@ -158,8 +156,14 @@ def _limit_flags(
 def join(product: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     """Merge product and correlation; a variable that both hold is that of the product.
 
-    An earlier correlation in the product is replaced.
+    An earlier correlation in the product is replaced, also the series of its file.
     """
+    replaced = [
+        name
+        for name in map(str, result["driver"].values)
+        if name in product and not product[name].identical(result[name])
+    ]
+    product = product.drop_vars(replaced)
     earlier = [str(name) for name in product.get("driver", xr.DataArray([])).values]
     sensitivities = [
         name

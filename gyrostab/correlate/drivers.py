@@ -31,13 +31,14 @@ _POWER = re.compile(r"(/?)\s*([^\s\d/*^.()+-]+)(?:\^|\*\*)?([+-]?\d+)?")
 
 @dataclass(frozen=True)
 class Driver:
-    """A channel, or its rate of change (`derived`), by (lag, window)."""
+    """A channel of the product or a file, or its rate of change (`derived`), by (lag, window)."""
 
     name: str
     label: str
     units: str
     values: Array
     derived: bool = False
+    of_product: bool = False
 
 
 def align_drivers(
@@ -71,13 +72,13 @@ def align_drivers(
         raise OptionError("give at least one channel, for instance temperature")
     if len(channels) == 1:
         return _align_channel(product, channels[0], lags, step)
+    of_files = {str(item.name): item for item in channels if not isinstance(item, str)}
     drivers = []
     for channel in channels:
-        rate_of = (
-            channel.removesuffix("_rate")
-            if isinstance(channel, str) and channel not in product
-            else channel
-        )
+        rate_of = channel
+        if isinstance(channel, str) and channel not in product:
+            name = channel.removesuffix("_rate")
+            rate_of = of_files.get(name, name)
         drivers.append(_align_channel(product, rate_of, lags, step)[0 if rate_of is channel else 1])
     names = [driver.name for driver in drivers]
     if len(set(names)) < len(names):
@@ -109,7 +110,14 @@ def _align_channel(
     mean, rate = mean * factor + offset, rate * factor
     label = name.replace("_", " ")
     return [
-        Driver(name, label, units, mean, is_rate_of_change(name, product)),
+        Driver(
+            name,
+            label,
+            units,
+            mean,
+            derived=is_rate_of_change(name, product),
+            of_product=isinstance(channel, str),
+        ),
         Driver(
             f"{name}_rate",
             f"rate of change of {label}",

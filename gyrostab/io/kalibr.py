@@ -40,6 +40,7 @@ from gyrostab.allan.davar import davar
 from gyrostab.allan.fit import fit_noise
 from gyrostab.allan.summary import FitSummary, TermSummary, summarise_fit, summarise_terms
 from gyrostab.errors import OptionError, SchemaError
+from gyrostab.ingest.convert import as_log
 from gyrostab.ingest.make_log import make_log
 from gyrostab.ingest.uniform import cut_log
 from gyrostab.noise import LAWS
@@ -83,6 +84,7 @@ def convert_terms(
 
 def _fit_accelerometers(log: xr.Dataset, product: xr.Dataset) -> xr.Dataset:
     """Fit the noise of the accelerometers of a log in the windows of a product, in g for deg/h."""
+    log = as_log(log)
     rate = float(log.attrs["sampling_rate_hz"])
     sample = np.timedelta64(round(1e9 / rate), "ns")
     bounds = product["time_bounds"].values

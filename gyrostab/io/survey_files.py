@@ -42,6 +42,7 @@ WEIGHTS = {code: weight for rows in TABLES.values() for code, _, _, weight in ro
 #: Unit -> unit in the JSON of ISCWSA; g-dependent terms are per g, the acceleration in the weights.
 _JSON_UNITS = {"deg/h": "deg/hr", "deg/sqrt(h)": "deg/sqr(hr)", "deg/h/g": "deg/hr"}
 _WITSML_UNITS = {"deg/h": "dega/h", "deg/sqrt(h)": "dega/sqrt(h)", "deg/h/g": "dega/h/gn"}
+_WITSML_CHANNEL_UNITS = {"g": "gn", "degree_Celsius": "degC"}  # that WITSML spells otherwise
 _MAX_TEXT = 2000  # characters of a description in WITSML
 _NO_HASH = 32 * "0"
 
@@ -249,7 +250,7 @@ def _make_witsml(
     for channel, (low, high, unit) in model.validity.items():
         _add_element(constraints, "CustomRange", {
             "EndInclusive": "true", "StartInclusive": "true", "Start": low, "End": high,
-            "Title": channel, "Uom": unit,
+            "Title": channel, "Uom": _WITSML_CHANNEL_UNITS.get(unit, unit),
         })  # fmt: skip
     _add_element(root, "Authorization", {
         "ApprovalAuthority": "none: to be confirmed by a survey engineer",

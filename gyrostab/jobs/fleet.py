@@ -323,7 +323,9 @@ def _is_current(
     reports: bool,
 ) -> bool:
     """Whether row, product and report of a run are those of its files and options."""
-    if row is None or row["error"] or (reports and not exists(target / str(row["report"]))):
+    if row is None or row["error"]:
+        return False
+    if reports and not (row["report"] and exists(target / str(row["report"]))):
         return False
     made_by = read_job_name(product_path(target, item.name))
     return bool(row.get("job") == made_by == find_job_name(item.files, **options))

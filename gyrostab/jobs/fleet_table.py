@@ -194,7 +194,8 @@ def read_rows(target: Path) -> dict[str, dict[str, Any]]:
 
 
 def make_table(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) -> pd.DataFrame:
-    """Make the table of runs, with the verdicts of their diagnoses."""
+    """Make the table of runs, with the verdicts of their diagnoses and their present tools."""
+    tools = {item.name: {"tool": item.tool} for item in runs}
     diagnosed = {
         item.name: (item.verdict, full_name(item.diagnosis)) for item in runs if item.diagnosis
     }
@@ -204,6 +205,7 @@ def make_table(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) ->
             {
                 **dict.fromkeys(first),
                 **rows[name],
+                **tools.get(name, {}),
                 **dict(zip(("verdict", "diagnosis"), diagnosed.get(name, ("", "")), strict=True)),
             }
             for name in sorted(rows)

@@ -162,5 +162,8 @@ RESERVED_NAMES = frozenset(
 def attributes(name: str, *, variance: str = "Allan") -> dict[str, Any]:
     """A fresh copy of the attributes of a product variable, for the variance of that name."""
     attrs = dict(VARIABLES[name])
-    attrs["long_name"] = attrs["long_name"].replace("Allan variance", f"{variance} variance")
+    label = attrs["long_name"].replace("Allan variance", f"{variance} variance")
+    if variance != "Allan":  # only those of the Allan variance are second differences
+        label = label.replace("second differences", "third differences")
+    attrs["long_name"] = label
     return attrs

@@ -15,6 +15,8 @@ from gyrostab.wording import list_some
 
 #: Examples of averaging times, for messages.
 TAUS = "40 (how many), octave, all or 0.1s,1s,10s for taus (--taus)"
+#: Relative error of a duration that was printed with six digits, as the messages print it.
+PRINTED_DIGITS = 1e-5
 #: Largest share by which an averaging time of a list is rounded without a warning: from three
 #: samples on, none is rounded by more.
 _MAX_ROUNDING_SHARE = 0.2
@@ -186,7 +188,7 @@ def averaging_factors(
     longest = window // order
     limit = 2 * window // (3 * order)
     if tau_max is not None:
-        limit = int(duration_seconds(tau_max, "tau_max") * rate + 1e-6)
+        limit = int(duration_seconds(tau_max, "tau_max") * rate * (1 + PRINTED_DIGITS) + 1e-6)
         if limit > longest or limit < 1:
             raise OptionError(
                 f"tau_max of {limit / rate:g} s does not fit the window of {window / rate:g} s; "

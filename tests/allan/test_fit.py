@@ -438,6 +438,14 @@ def test_averaging_times_with_a_disturbance_can_be_left_out():
         fit_noise(surface, tau_min="2h")
 
 
+def test_the_fit_begins_at_an_averaging_time_of_six_digits():
+    log = make_log(np.random.default_rng(3).standard_normal(12_000), rate=300.0, unit="deg/h")
+    surface = davar(log, window="40s")
+    for tau in surface["tau"].values[:-4]:
+        product = fit_noise(surface, tau_min=f"{tau:g}s")
+        assert product.attrs["fit_tau_min_s"] == pytest.approx(tau, rel=1e-9)
+
+
 def test_windows_fitted_again_keep_the_averaging_times_of_the_product():
     """A tone lies below ``tau_min``, so that only a fit from there on describes the windows."""
     x = white(np.random.default_rng(12), 3, 4000, N=0.01, rate=RATE)

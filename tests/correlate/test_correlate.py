@@ -233,6 +233,55 @@ def test_rate_of_change_is_a_driver_only_if_it_is_named_with_others():
         gyrostab.correlate(product, channel=[])
 
 
+def probe_of(product: xr.Dataset, *, degrees: float) -> xr.DataArray:
+    """Make a channel like that of a file, with its own times, beside the temperature."""
+    values = degrees + product["temperature"].values
+    times = {"time_probe": product["time"].values}
+    return xr.DataArray(values, times, ["time_probe"], "temperature", {"units": "degC"})
+
+
+def test_a_second_file_replaces_the_series_of_the_first():
+    product = shaken_product(slope=0.3)
+    options = {"variables": "window_mean", "max_lag": 0}
+    for degrees in (30.0, 100.0):
+        result = gyrostab.correlate(product, channel=probe_of(product, degrees=degrees), **options)
+        product = join(product, result)
+        series = product["temperature_of_file"].values
+        np.testing.assert_allclose(series, degrees + product["temperature"].values, atol=1.0)
+
+
+def test_rate_of_change_of_a_file_is_named_beside_it(tmp_path, capsys):
+    product = shaken_product(slope=0.3)
+    probe = probe_of(product, degrees=0.0).rename("probe")
+    correlation = gyrostab.correlate(
+        product, channel=[probe, "probe_rate"], variables="window_mean", max_lag=0
+    )
+    assert list(correlation["driver"].values) == ["probe", "probe_rate"]
+    gyrostab.to_netcdf(product.drop_vars("temperature_rate"), tmp_path / "product.nc")
+    stamps = product["time"].dt.strftime("%Y-%m-%dT%H:%M:%SZ").values
+    rows = [f"{at},{value}" for at, value in zip(stamps, probe.values, strict=True)]
+    (tmp_path / "probe.csv").write_text("\n".join(["time,probe [degC]", *rows]))
+    options = ["--with", "probe,probe_rate", "--channel", str(tmp_path / "probe.csv")]
+    assert main(["correlate", str(tmp_path / "product.nc"), *options]) == 0
+    assert "rate of change of probe" in capsys.readouterr().out
+
+
+def test_windows_that_lost_all_samples_count_where_the_loss_is_correlated():
+    """Vibration of 120 s in 240 s, in which all samples are lost."""
+    shaken = np.arange(36_000) // 1200 % 2 == 1
+    rates = np.where(shaken, np.nan, np.random.default_rng(3).standard_normal(36_000))
+    log = gyrostab.make_log(
+        rates, rate=10.0, unit="deg/h", channels={"vibration": (2.0 * shaken, "g")}
+    )
+    product = gyrostab.fit_noise(gyrostab.davar(log, window="40s", step="40s"))
+    correlation = gyrostab.correlate(
+        product, channel="vibration", variables="window_coverage", max_lag=0
+    )
+    slope = float(correlation["window_coverage_per_vibration"].isel(axis=0))
+    assert int(correlation["windows_used"].max()) == product.sizes["time"]
+    assert slope == pytest.approx(-0.5, abs=0.02)
+
+
 def test_several_drivers_on_the_command_line(tmp_path, capsys):
     path = gyrostab.to_netcdf(shaken_product(slope=0.3), tmp_path / "product.nc")
     command = ["correlate", str(path), "--max-lag", "0s"]

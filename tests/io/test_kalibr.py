@@ -189,6 +189,17 @@ class TestAccelerometers:
         assert text["accelerometer_noise_density"] == densities["z"]
         assert text["accelerometer_random_walk_meaning"] == "upper_limit_only"
 
+    def test_accelerations_in_another_unit_are_converted(self):
+        log = make_accelerometers()
+        metric = log["accel_x"].copy(data=9.80665 * log["accel_x"].values)
+        metric.attrs["units"] = "m s-2"
+        product = gyrostab.fit_noise(gyrostab.davar(log, window="1min"))
+        expected, got = (
+            fit_accelerometers(made, product)["N"].values
+            for made in (log, log.assign(accel_x=metric))
+        )
+        np.testing.assert_allclose(got, expected, rtol=1e-9)
+
     def test_random_walk_is_that_of_the_samples(self):
         """A random walk of k m/s^3/sqrt(Hz) has steps of k sqrt(interval) from sample to sample."""
         walk, rate = 1e-3, 10.0

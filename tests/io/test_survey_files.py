@@ -191,10 +191,11 @@ class TestWitsml:
 
     def test_conditions_are_ranges(self, tmp_path):
         ranges = {
-            element.find(f"{WITSML}Title").text: float(element.find(f"{WITSML}End").text)
+            element.find(f"{WITSML}Title").text: element
             for element in self.make(tmp_path).iter(f"{WITSML}CustomRange")
         }
-        assert ranges["temperature"] == 85.0
+        assert float(ranges["temperature"].find(f"{WITSML}End").text) == 85.0
+        assert ranges["temperature"].find(f"{WITSML}Uom").text == "degC"
 
     @pytest.mark.full
     @pytest.mark.parametrize("speed", [None, 0.5])

@@ -81,6 +81,16 @@ def done(archive, tmp_path_factory) -> Path:
     return output
 
 
+def test_reports_that_are_missing_are_written_and_tools_are_those_of_the_call(tmp_path):
+    write_log(tmp_path / "in" / "SN7" / "r1.nc", 6)
+    run_fleet([tmp_path / "in"], tmp_path / "out", **OPTIONS)
+    table = run_fleet(
+        [tmp_path / "in"], tmp_path / "out", **{**OPTIONS, "reports": True, "tool": "[0-9]"}
+    )
+    assert list(table["tool"]) == ["7"]
+    assert (tmp_path / "out" / "reports" / f"{table['run'][0]}.html").exists()
+
+
 # ------------------------------------------------------------------------------
 # which files are a run
 

@@ -57,6 +57,13 @@ def test_averaging_times_that_rounding_changes_have_a_warning():
         assert averaging_factors("0.0195s,0.07s", rate=50.0, window=1000).tolist() == [1, 4]
 
 
+def test_printed_averaging_times_are_found_again():
+    """Messages print six digits of an averaging time."""
+    for factor in (7, 10, 242, 3333):
+        tau = f"{factor / 300.0:g}s"
+        assert averaging_factors("all", rate=300.0, window=10_000, tau_max=tau)[-1] == factor
+
+
 def test_tau_max_limits_a_list():
     factors = averaging_factors(["1s", "4s"], rate=100.0, window=1000, tau_max="2s")
     assert factors.tolist() == [100]

@@ -107,7 +107,12 @@ def correlate(
         stage("correlating", 0)
         dataset = open_product(product)
         names = [name.strip() for part in with_ or ["temperature"] for name in part.split(",")]
-        from_file = {name for name in names if len(names) == 1 or name not in dataset}
+        from_file = {
+            name
+            for name in names
+            if len(names) == 1
+            or not (name in dataset or (name.removesuffix("_rate") in {*names} - {name}))
+        }
         channels = [
             read_channel(file, name, **options) if file and name in from_file else name
             for name in names
