@@ -3,7 +3,7 @@
     python benchmarks/settings_derivations.py [--records 400]
 
 Prints, for the shortest and the longest blocks, how often white noise alone exceeds `noisy_sigma`,
-`excess_sigma`, `moving_power_ratio`, `known_line_sigma` and `line_nats`, and which vibrations
+`excess_sigma`, `known_line_sigma` and `line_nats`, and which vibrations
 exceed `level_correlation`. The powers of white noise are gamma distributed with as many degrees of
 freedom as a band has lines, so that all but `line_nats` follow in closed form.
 """
@@ -57,8 +57,6 @@ def main() -> None:
         for name in ("noisy_sigma", "excess_sigma"):
             share = exceedance(getattr(DEFAULTS, name), lines)
             print(f"- {name}: P = {share:.2g} a block, {share * blocks:.2g} blocks of a record")
-        above = gamma.sf(DEFAULTS.moving_power_ratio * blocks * bands, blocks * bands)
-        print(f"- moving_power_ratio: P = {1.0 - np.prod(1.0 - above):.2g} of any band")
         share = exceedance(DEFAULTS.known_line_sigma, blocks / RECORD_PARTS)
         print(f"- known_line_sigma: P = {share:.2g} a line and part")
         best = np.sort(largest_line(blocks, records))

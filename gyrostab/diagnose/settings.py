@@ -136,13 +136,6 @@ class Settings:
         "that of g uniform from 1.5 % of its largest value up; sqrt(15) / 4 = 0.968 from zero "
         "(benchmarks/settings_derivations.py)",
     )
-    moving_power_ratio: float = _make_setting(
-        1.5,
-        "1",
-        "Power over expected power, in any band, above which an axis moves.",
-        "P = 0.06 that any of 13 bands exceeds it by chance in the shortest record, 24 blocks; "
-        "none in long ones (benchmarks/settings_derivations.py)",
-    )
     fast_blocks: float = _make_setting(
         2.0,
         "block",
@@ -178,12 +171,6 @@ class Settings:
         "surrogate",
         "Time-shifted surrogates without which a channel is not tested.",
         "the least round number that can show a share of 5 %",
-    )
-    max_earth_rate: float = _make_setting(
-        20.0,
-        "degree hour-1",
-        "Largest earth rate on an axis.",
-        "choice: 15.04 deg/h and a third for the error of the scale",
     )
     min_comb_lines: int = _make_setting(
         3, "1", "Lines that may be one comb.", "two lines define a spacing; the third tests it"
@@ -410,12 +397,6 @@ class Settings:
         "Relative error of number and size of outliers, as the law of their sizes is unknown.",
         "choice; at least half of the logarithm of the share of outliers that is seen",
     )
-    score_error_share: float = _make_setting(
-        0.3,
-        "1",
-        "Share of the score of a mismatch that an error of the form of its effect may leave.",
-        "root of `spectrum_error_share`: evidence is the square of a score",
-    )
     coverage_tolerance: float = _make_setting(
         0.013,
         "1",
@@ -451,6 +432,14 @@ class Settings:
             value = getattr(self, item.name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{item.name}={value!r}: give a number from 0 up")
+
+    @property
+    def score_error_share(self) -> float:
+        """Share of the score of a mismatch that an error of the form of its effect may leave.
+
+        The root of `spectrum_error_share`, because evidence is the square of a score.
+        """
+        return math.sqrt(self.spectrum_error_share)
 
     @property
     def reject_nats(self) -> float:

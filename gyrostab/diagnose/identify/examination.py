@@ -158,15 +158,10 @@ def _score_null_records(
     count_evidence = CountEvidence.gathered(small, rounded)
     data = xr.concat(small, "record", data_vars="minimal", coords="minimal", compat="override")
     last = compute_evidence(at_end, data, state, folds, count_evidence=count_evidence)
-    counts = [evidence for evidence in last if evidence.candidate.statistic.is_count]
-    others = [evidence for evidence in last if not evidence.candidate.statistic.is_count]
     for of_chunks in zip(*chunks, strict=True):
         evidence_nats = np.concatenate([evidence.evidence_nats for evidence in of_chunks])
-        others.append(replace(of_chunks[0], evidence_nats=evidence_nats))
-    sums = [evidence_by_effect(others), evidence_by_effect(counts)]
-    zero = np.zeros(records)
-    best = [sums[0].get(key, zero) + sums[1].get(key, zero) for key in {*sums[0], *sums[1]}]
-    return np.sort(np.max(best, axis=0)), count_evidence
+        last.append(replace(of_chunks[0], evidence_nats=evidence_nats))
+    return np.sort(np.max([*evidence_by_effect(last).values()], axis=0)), count_evidence
 
 
 def nuisance_alternatives(blocks: xr.Dataset) -> list[Candidate]:

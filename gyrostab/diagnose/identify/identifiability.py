@@ -18,7 +18,6 @@ from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.predict.sizes import component_mixture, component_size
 from gyrostab.diagnose.predict.windows import make_surrogates, max_correlation
-from gyrostab.diagnose.reduce.block_statistics import measured
 from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes
 from gyrostab.diagnose.statistics.base import Competitor
 from gyrostab.diagnose.statistics.candidates import largest_size
@@ -127,16 +126,9 @@ def _rotation_share(component: Component, state: State) -> float:
 
 
 def _is_possible(component: Component, state: State) -> bool:
-    """Return whether physics allows the size of a component, and its cause is present."""
+    """Return whether physics allows the size of a component."""
     effect, statistic, settings = component.candidate.effect, component.statistic, state.settings
-    is_at_rest = (
-        effect == "misalignment"
-        and statistic.is_transfer
-        and not _is_moving(component.candidate.reference[0], state)
-    )
-    if is_at_rest or (
-        _is_rotation(component) and _rotation_share(component, state) < settings.min_rotation_share
-    ):
+    if _is_rotation(component) and _rotation_share(component, state) < settings.min_rotation_share:
         return False
     is_too_large = (
         effect == "scale_factor"
@@ -200,7 +192,6 @@ def _allowed_range(component: Component, column: str, state: State) -> tuple[flo
     example, does not improve a gyro.
     """
     effect, statistic, variant = component.candidate.effect, component.statistic, component.variant
-    largest = largest_size(effect, state.settings)
     parameters = {item.name: item for item in effects()[effect].parameters()}
     if column not in parameters:
         return -math.inf, math.inf
@@ -208,19 +199,8 @@ def _allowed_range(component: Component, column: str, state: State) -> tuple[flo
     if statistic.is_power:
         has_least = not variant.squared and len(variant.columns) == 1
         return item.low if has_least else -math.inf, math.inf
-    if statistic.is_linear_in_means:
-        largest = min(largest, max(abs(item.low), abs(item.high)))
+    largest = min(largest_size(effect, state.settings), max(abs(item.low), abs(item.high)))
     return -largest, largest
-
-
-def _is_moving(axis: str, state: State) -> bool:
-    """Return whether an axis exceeds its noise at some frequency; what is at rest cannot leak."""
-    row = state.axes.index(axis)
-    expected = state.baseline["spectrum"].values[row]
-    return bool(
-        np.nanmax(np.nanmean(measured(state.blocks, "power").values[row] / expected, axis=0))
-        > state.settings.moving_power_ratio
-    )
 
 
 def find_equivalent_effects(

@@ -25,12 +25,6 @@ from gyrostab.diagnose.result.text import (
 from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.wording import join_words
 
-#: Nuisance alternative -> `view` in `diagnosis.json`.
-_NUISANCE_VIEWS = {
-    "~bias(t)": "mean", "~levels": "mean", "~red": "mean", "~N(t)": "davar", "~burst": "davar",
-    "~S(f)": "davar", "~cov": "cross_axis", "~outliers": "distribution",
-}  # fmt: skip
-
 
 def _make_mismatch(
     blocks: xr.Dataset,
@@ -128,7 +122,7 @@ def unidentified_mismatches(
     longest = float(blocks["end"].values[-1]) / 2.0
     null = fit_best_evidence(identifications.null_best, settings=identifications.state.settings)
     for unidentified in identifications.unknown:
-        view = _NUISANCE_VIEWS.get(unidentified.effect, "davar")
+        view = unidentified.components[0].statistic.view
         if any(
             region["view"] == view
             and set(region["axes"]) & set(unidentified.axes)

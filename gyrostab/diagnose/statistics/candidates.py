@@ -207,10 +207,10 @@ def _nuisance_grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, A
 
 
 def largest_size(effect: str, settings: Settings) -> float:
-    """Return the largest plausible size of the parameters of an effect, infinite for most."""
+    """Return the largest size that hides in noise or is plausible, infinite for most effects."""
     return {
         "misalignment": 1e3 * settings.max_misalignment_share,  # mrad
-        "earth_rate": settings.max_earth_rate,
+        "earth_rate": effects()["earth_rate"].parameters()[0].high,
     }.get(effect, math.inf)
 
 

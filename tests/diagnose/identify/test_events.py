@@ -170,22 +170,6 @@ def test_only_motion_is_a_misalignment(moves: bool) -> None:
     assert moves or float(evidence.evidence_nats.max()) < 3.0
 
 
-@pytest.mark.parametrize("sway", [0.0, 3.0])
-def test_axis_at_rest_cannot_leak(sway: float) -> None:
-    """Whatever evidence chance gives to a leak."""
-    rng = np.random.default_rng(6)
-    rate = WHITE * rng.standard_normal((2, SECOND.size))
-    rate[1] += sway * WHITE * np.sin(2.0 * np.pi * 1.7 * SECOND)
-    state = state_of_rates(rate)
-    leak = next(
-        known
-        for known in effect_candidates(state.blocks, state.baseline["coefficient"])[0]
-        if known.key == "misalignment(y)"
-    )
-    component = Component(leak, leak.variants[0], ("x",), 20.0)
-    assert keep_physical([component], state)[0] == ([component] if sway else [])
-
-
 @pytest.mark.parametrize("leak", [0.0, 0.003])
 def test_leak_must_exceed_time_shifted_surrogates(leak: float) -> None:
     rng = np.random.default_rng(8)
