@@ -36,6 +36,7 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.task import (
     NamedBlocks,
     Task,
+    check_axis_names,
     check_options,
     lines_without_motion,
     read_simulation,
@@ -118,6 +119,7 @@ def diagnose(
 
     check_options(nulls, false_alarm_level, seed)
     log = as_log(log)
+    check_axis_names(log)
     task = Task(
         log,
         read_simulation(simulation, log),

@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -115,8 +116,18 @@ def _describe_stamps(log: xr.Dataset) -> dict[str, str]:
     }
 
 
+def check_axis_names(log: xr.Dataset) -> None:
+    """Refuse names of axes with characters that separate them in the lists of a diagnosis."""
+    for axis in map(str, log["axis"].values):
+        if any(character in axis for character in ", "):
+            raise SchemaError(
+                f"axis {axis!r}: a diagnosis lists axes with blanks and commas between them; "
+                "rename it, for instance with log.assign_coords(axis=['x', 'y', 'z'])"
+            )
+
+
 def varying_axes(blocks: xr.Dataset) -> list[str]:
-    """Find the axes whose samples are not all the same, and warn of the others.
+    """Find the axes whose samples are present and not all the same, and warn of the others.
 
     Raises
     ------
@@ -126,20 +137,19 @@ def varying_axes(blocks: xr.Dataset) -> list[str]:
     largest_power = blocks["power"].max(["block", "band"]).values
     axes = [str(axis) for axis in blocks["axis"].values]
     varying = [
-        axis
-        for axis, power in zip(axes, largest_power, strict=True)
-        if not power <= MAX_ROUNDING_POWER
+        axis for axis, power in zip(axes, largest_power, strict=True) if power > MAX_ROUNDING_POWER
     ]
-    constant = ", ".join(axis for axis in axes if axis not in varying)
+    empty = ", ".join(compress(axes, np.isnan(largest_power)))
+    constant = ", ".join(compress(axes, largest_power <= MAX_ROUNDING_POWER))
+    reasons = [f"all samples are the same on axis {constant}"] * bool(constant)
+    reasons += [f"too many samples are missing for a spectrum on axis {empty}"] * bool(empty)
     if not varying:
         raise SchemaError(
-            f"all samples are the same on axis {constant}: without noise there is nothing to "
-            "compare; check that the right column was read"
+            f"{', and '.join(reasons)}: without noise there is nothing to compare; check that the "
+            "right column was read"
         )
-    if constant:
-        warnings.warn(
-            f"all samples are the same on axis {constant}: left out of the diagnosis", stacklevel=7
-        )
+    for reason in reasons:
+        warnings.warn(f"{reason}: left out of the diagnosis", stacklevel=7)
     return varying
 
 

@@ -18,7 +18,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     NOISE,
     common_variance,
     noise_powers,
-    separate_share,
+    reduced_shape,
     sum_noise,
     white_variance,
 )
@@ -253,20 +253,19 @@ def _fit_quiescent_powers(
 
 def _average_quiescent(blocks: xr.Dataset, chosen: NDArray[np.bool_], columns: Array) -> list[Fit]:
     """Average the powers of the chosen blocks of every axis; columns (axis, block, band, term)."""
-    common, shape_alone = common_variance(blocks)
-    power, shape = blocks["power"].values, blocks["shape"].values
+    power, shape = blocks["power"].values, reduced_shape(blocks)
     fits = []
     for row, axis in enumerate(blocks["axis"].values):
         use = chosen[row]
         fit = average_blocks(power[row][use], shape[row][use], columns[row][use])
-        if fit.power.size < 4:
+        bands = np.count_nonzero(fit.power > 0.0)
+        if bands < 4:
             raise SchemaError(
-                f"axis {axis}: the quiescent blocks hold spectra in {fit.power.size} bands, "
-                "too few to calibrate on; give other stretches with --quiet, or diagnose a part "
-                "of the record with fewer gaps"
+                f"axis {axis}: the quiescent blocks hold noise in {bands} bands, too few to "
+                "calibrate on; give other stretches with --quiet, leave the axis out (--axis), or "
+                "diagnose a part of the record with fewer gaps"
             )
-        share = separate_share(shape[row][use], shape_alone[row][use], common[row][use])
-        fits.append(fit._replace(weight=fit.weight * share))
+        fits.append(fit)
     return fits
 
 

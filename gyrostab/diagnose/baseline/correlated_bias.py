@@ -22,8 +22,7 @@ from scipy.optimize import OptimizeResult
 
 from gyrostab.diagnose.baseline.axis_means import AxisMeans, find_peaks
 from gyrostab.diagnose.baseline.expected_statistics import (
-    common_variance,
-    separate_share,
+    reduced_shape,
 )
 from gyrostab.diagnose.baseline.posterior import (
     Fit,
@@ -283,7 +282,7 @@ def _find_free_bands(state: State, axis: str) -> NDArray[np.bool_]:
 def _axis_record(state: State, axis: str) -> _AxisRecord | None:
     """Collect the means and powers of an axis, averaged over blocks of similar power."""
     blocks, baseline, row = state.blocks, state.baseline, state.axes.index(axis)
-    power, shape = (blocks[name].values[row] for name in ("power", "shape"))
+    power, shape = blocks["power"].values[row], reduced_shape(blocks)[row]
     power = np.where(_find_free_bands(state, axis), np.nan, power)
     chosen = ~state.masked[row] & (np.isfinite(power) & np.isfinite(shape)).any(axis=1)
     values = mean_residual(blocks, baseline, axis)
@@ -291,7 +290,6 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
     if chosen.sum() < MIN_BLOCKS or present.sum() < MIN_BLOCKS:
         return None
     bands = blocks.sizes["band"]
-    common, shape_alone = (array[row] for array in common_variance(blocks))
     columns, known = axis_values(baseline, "columns", axis), _power_of_effects(state, axis)
     cells = np.stack(
         [
@@ -311,9 +309,8 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
         chosen,
         _LEVEL_GROUPS if varies else 1,
     )
-    share = separate_share(shape[chosen], shape_alone[chosen], common[chosen])
     columns = fit.columns
-    fit = Fit(fit.power, columns[:, :4], fit.weight * share)
+    fit = Fit(fit.power, columns[:, :4], fit.weight)
     square = with_floor(fit_squares(fit)[0], fit)
     block, variance = float(blocks.attrs["block_s"]), axis_values(baseline, "mean_variance", axis)
     means = AxisMeans(

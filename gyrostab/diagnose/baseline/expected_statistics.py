@@ -78,14 +78,17 @@ def common_variance(blocks: xr.Dataset) -> tuple[Array, Array]:
     return common, np.asarray(1.0 / (1.0 / shape - common[..., None]))
 
 
-def separate_share(shape: Array, shape_alone: Array, common: Array) -> float:
-    """Return the share of the shapes (block, band) of an axis that its average powers have.
+def reduced_shape(blocks: xr.Dataset) -> Array:
+    """Return the shapes (axis, block, band) of powers as if those of a block were independent.
 
-    The rest is lost to the scatter that all bands of a block have in common; see `common_variance`.
+    They are reduced by the scatter that all bands of a block have in common; see `common_variance`.
     """
-    block_shape = np.nansum(shape_alone, axis=1)
-    separate = float((block_shape / (1.0 + common * block_shape)).sum())
-    return min(1.0, separate / max(float(np.nansum(shape)), 1e-300))
+    shape = blocks["shape"].values
+    common, shape_alone = common_variance(blocks)
+    block_shape = np.nansum(shape_alone, axis=2)
+    separate = block_shape / (1.0 + common * block_shape)
+    share = np.minimum(separate / np.maximum(np.nansum(shape, axis=2), 1e-300), 1.0)
+    return np.asarray(shape * share[..., None])
 
 
 def white_variance(blocks: xr.Dataset, square: Array) -> Array:

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.calibrate import assemble_baseline
-from gyrostab.diagnose.baseline.expected_statistics import NOISE, common_variance, line_columns
+from gyrostab.diagnose.baseline.expected_statistics import NOISE, line_columns, reduced_shape
 from gyrostab.diagnose.baseline.known_effects import expect_known_effects
 from gyrostab.diagnose.baseline.known_lines import independent_line_share
 from gyrostab.diagnose.baseline.posterior import DRAWS, Posterior
@@ -169,7 +169,7 @@ def scale_to_quiescent(
         factor, error = fitted
         factors.append(factor)
         sizes.append(f"{math.sqrt(factor):.3g} on axis {axis}")
-        rng = np.random.default_rng(row)
+        rng = np.random.default_rng(0)  # of any axis, so that their order does not matter
         scatter = rng.gamma(error**-2, error**2, (len(posterior.draws), 1))
         scaled.append(
             posterior._replace(
@@ -198,16 +198,11 @@ def fit_noise_factor(
     `added` is the power that effects add. Return the factor with the largest gamma likelihood, and
     the share of its error; None without any spectrum.
     """
-    power, shape = (blocks[name].values[0] for name in ("power", "shape"))
-    common, shape_alone = (values[0] for values in common_variance(blocks))
+    power, shape = blocks["power"].values[0], reduced_shape(blocks)[0]
     good = np.isfinite(power) & np.isfinite(shape) & chosen[:, None] & (noise > 0.0)
     if not good.any():
         return None
-    separate_shape = np.where(good, shape_alone, 0.0).sum(axis=1)
-    # see `common_variance`
-    reduction = 1.0 / (1.0 + np.where(chosen, common, 0.0) * separate_shape)
-    weight = (shape * np.broadcast_to(reduction[:, None], good.shape))[good]
-    return _fit_factor(power[good], noise[good], added[good], weight)
+    return _fit_factor(power[good], noise[good], added[good], shape[good])
 
 
 def _fit_factor(power: Array, noise: Array, added: Array, weight: Array) -> tuple[float, float]:

@@ -327,7 +327,8 @@ def noise_posterior(
         Random processes of effects in the means.
     """
     mean, step = blocks["mean"].values[row], float(blocks.attrs["block_s"])
-    present, rng = use & np.isfinite(mean), np.random.default_rng(row)
+    present = use & np.isfinite(mean)
+    rng = np.random.default_rng(0)  # of any axis, so that their order does not matter
     square, information, spectrum = fit_squares(fit)
     density = HOUR * float(with_floor(square, fit)[1])
     coarse_K, coarse_B = fine_grid(density, mean.size * step, step)

@@ -11,8 +11,7 @@ from scipy.optimize import minimize_scalar
 
 from gyrostab.diagnose.baseline.expected_statistics import (
     band_columns,
-    common_variance,
-    separate_share,
+    reduced_shape,
 )
 from gyrostab.diagnose.baseline.posterior import (
     Fit,
@@ -169,8 +168,7 @@ def _average_powers(axis: str, state: State) -> tuple[Fit, Array]:
     The second result is how gaps mix the bands of the noise.
     """
     blocks, row = state.blocks, state.axes.index(axis)
-    power, shape = (blocks[name].values[row] for name in ("power", "shape"))
-    common, shape_alone = (values[row] for values in common_variance(blocks))
+    power, shape = blocks["power"].values[row], reduced_shape(blocks)[row]
     effects_of_axis = state.power_columns(axis)
     columns = [unspread_share(blocks)[row, :, None], state.weight[row], *effects_of_axis]
     averaged = average_blocks(
@@ -183,7 +181,6 @@ def _average_powers(axis: str, state: State) -> tuple[Fit, Array]:
     mixing = np.diag(unspread[:, 0]) + (1.0 - unspread) * (width / width.sum())
     return averaged._replace(
         columns=mixing @ band_columns(blocks),
-        weight=averaged.weight * separate_share(shape, shape_alone, common),
         free_columns=free / np.maximum(np.abs(free).max(axis=0), 1e-300),
         start=start[:, 0],
     ), mixing

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from gyrostab.diagnose.baseline.calibrate import assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import (
     NOISE,
-    common_variance,
     noise_powers,
+    reduced_shape,
     white_variance,
 )
 from gyrostab.diagnose.baseline.known_effects import random_means
@@ -285,18 +285,12 @@ def _fit_noise(
 ) -> Posterior | None:
     """Fit the noise of an axis with the effects; None where too little is left to determine it."""
     blocks = state.blocks
-    power, shape = (blocks[name].values[row] for name in ("power", "shape"))
+    power, shape = blocks["power"].values[row], reduced_shape(blocks)[row]
     chosen = chosen & (np.isfinite(power) & np.isfinite(shape)).any(axis=1)
     if chosen.sum() < MIN_BLOCKS:
         return None
     columns = noise_powers(blocks, axis_effects.response)[row]
-    common, shape_alone = (values[row] for values in common_variance(blocks))
-    # reduced by the scatter that the bands of a block share
-    block_shape = np.nansum(shape_alone, axis=1)
-    separate = block_shape / (1.0 + common * block_shape)
-    share = np.minimum(separate / np.maximum(np.nansum(shape, axis=1), 1e-300), 1.0)
-    reduced = shape * share[:, None]
-    fit = _average_powers(power, reduced, columns, state.weight[row], axis_effects, chosen)
+    fit = _average_powers(power, shape, columns, state.weight[row], axis_effects, chosen)
     square, information, _ = fit_squares(fit)
     assert fit.start is not None
     plain = float((fit.weight / np.square(fit.start) * fit.columns[:, 1] ** 2).sum())

@@ -97,16 +97,17 @@ def _select_all(
     while effects_left > 0:
         all_evidence = score_candidates(examination, state, barred, with_last=is_last)
         selected = _select_next(examination, all_evidence, state, chosen, beaten)
-        has_effect = selected is not None and any(choice.is_named for choice in selected[0])
-        if not has_effect and not is_last:
-            is_last = True
-            continue
-        if selected is None:
-            break
-        is_last = False
-        selections, shifted = selected
+        selections, shifted = selected or ([], {})
         beaten |= shifted
         barred |= shifted.keys()
+        if shifted and not selections:
+            continue
+        if not is_last and not any(choice.is_named for choice in selections):
+            is_last = True
+            continue
+        if not selections:
+            break
+        is_last = False
         for selection in selections:
             if are_lines(selection.components):
                 lines_left -= 1

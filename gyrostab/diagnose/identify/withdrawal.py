@@ -85,10 +85,16 @@ def withdraw_effects(
         excess_nats = variance_fluctuation(
             examination.state_with([*remaining, *unidentified]), axis
         )
-        weak = _find_weak(examination, on_axis, excess_nats)
+        weak = _find_weak(examination, on_axis, axis, excess_nats)
         if weak:
             remaining = [
-                identification for identification in remaining if identification not in weak
+                reduced
+                for identification in remaining
+                for reduced in (
+                    _without_axis(identification, axis, examination.threshold)
+                    if identification in weak
+                    else [identification]
+                )
             ]
             reduced_state = examination.state_with([*remaining, *unidentified])
             withdrawn += _find_fluctuation(examination, reduced_state, axis, weak)
@@ -96,17 +102,17 @@ def withdraw_effects(
 
 
 def _find_weak(
-    examination: Examination, identified: Sequence[Selection], excess_nats: float
+    examination: Examination, identified: Sequence[Selection], axis: str, excess_nats: float
 ) -> list[Selection]:
-    """Return the effects that explain too little for what they leave [nats]."""
+    """Return the effects that explain too little on an axis for what they leave there [nats]."""
     settings = examination.settings
-    strength = sum(identification.evidence_nats for identification in identified)
+    strength = sum(_evidence_on(identification, axis) for identification in identified)
     allowed = settings.component_nats + settings.form_error_share * strength
     share = settings.spectrum_error_share
     return [
         identification
         for identification in identified
-        if excess_nats > max(allowed, share * identification.evidence_nats)
+        if excess_nats > max(allowed, share * _evidence_on(identification, axis))
     ]
 
 
@@ -148,14 +154,18 @@ def _without_part_of_drift(
         )
         if not is_part or _evidence_on(identification, axis) >= drift_nats:
             remaining.append(identification)
-            continue
-        elsewhere = [
-            component for component in identification.components if axis not in component.row
-        ]
-        evidence_nats = sum(max(sum_evidence(layer), 0.0) for layer in split_layers(elsewhere))
-        if evidence_nats >= threshold:
-            remaining.append(reduce_selection(identification, elsewhere, evidence_nats))
+        else:
+            remaining += _without_axis(identification, axis, threshold)
     return remaining
+
+
+def _without_axis(identification: Selection, axis: str, threshold: float) -> list[Selection]:
+    """Return an effect without an axis; nothing if it does not reach the threshold elsewhere."""
+    elsewhere = [component for component in identification.components if axis not in component.row]
+    evidence_nats = sum(max(sum_evidence(layer), 0.0) for layer in split_layers(elsewhere))
+    if evidence_nats < threshold:
+        return []
+    return [reduce_selection(identification, elsewhere, evidence_nats)]
 
 
 def _evidence_on(selection: Selection, axis: str) -> float:

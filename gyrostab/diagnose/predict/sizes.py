@@ -52,7 +52,7 @@ def mean_mixture(
     own_count = len(columns)
     scale = size[:own_count]
     return Mixture(
-        mixture.log_weight,
+        mixture.log_weight - np.log(scale).sum(),
         mixture.mean[:, :own_count] / scale,
         mixture.covariance[:, :own_count, :own_count] / np.outer(scale, scale),
     )

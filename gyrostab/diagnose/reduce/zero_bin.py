@@ -127,12 +127,13 @@ def sticking_value(values: Array, step: float) -> tuple[float, float]:
     >>> sticking_value(sticking, 0.0)[0], sticking_value(np.rint(10.0 * rate) / 10.0, 0.1)
     (0.5, (nan, 1.0))
     """
-    if not np.nanstd(values) > _MIN_SCATTER_STEPS * step:
+    present = values[np.isfinite(values)]
+    if not present.size or not present.std() > _MIN_SCATTER_STEPS * step:
         return np.nan, 1.0
     same = np.concatenate([[False], values[1:] == values[:-1]]) & (values != 0.0)
     starts = np.flatnonzero(same[1:] & ~same[:-1])
     levels, runs = np.unique(values[starts + 1], return_counts=True)
-    inside = (levels > np.nanmin(values)) & (levels < np.nanmax(values))
+    inside = (levels > present.min()) & (levels < present.max())
     if not inside.any():
         return np.nan, 1.0
     most = int(np.argmax(np.where(inside, runs, 0)))

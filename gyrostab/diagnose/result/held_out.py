@@ -14,6 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_on_known
+from gyrostab.diagnose.baseline.expected_statistics import reduced_shape
 from gyrostab.diagnose.estimate.conditioned_baseline import (
     expected_baseline,
     predict_baseline,
@@ -53,6 +54,11 @@ def measure_evidence(
     random biases and phase-locked components are in none of these: their evidence is added.
     """
     with_course, random_nats = _remove_random_biases(identifications)
+    first = [
+        fitted
+        for fitted in first
+        if not any(component.statistic.is_random_bias for component in fitted.components)
+    ]
     judged, phase_locked_nats = remove_phase_locked(with_course, blocks)
     identified = with_course.identified
     count_nats = sum(
@@ -302,7 +308,7 @@ def log_likelihood(
 
 def _power_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
     """Return the log-likelihood of the band powers of every block, by gamma laws."""
-    power, shape = (blocks[name].values for name in ("power", "shape"))
+    power, shape = blocks["power"].values, reduced_shape(blocks)
     spectrum = baseline["spectrum"].values
     has_data = np.isfinite(power) & np.isfinite(shape) & (spectrum > 0)
     safe = np.where(has_data, spectrum, 1.0)

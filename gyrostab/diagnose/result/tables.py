@@ -171,7 +171,8 @@ def rejected_tables(identifications: Identifications) -> list[dict[str, Any]]:
     """Return what beats each effect that was examined and not named, the closest first."""
     named = {identification.effect for identification in identifications.identified}
     closest_first = sorted(
-        identifications.rejected, key=lambda rejection: (rejection.nats, rejection.name)
+        identifications.rejected,
+        key=lambda rejection: (math.isnan(rejection.nats), rejection.nats, rejection.name),
     )
     return [rejection._asdict() for rejection in closest_first if rejection.name not in named]
 

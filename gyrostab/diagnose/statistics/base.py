@@ -272,7 +272,8 @@ class Statistic:
         """
         out: dict[str, tuple[float, ...]] = {}
         points: list[dict[str, float | str]] = []
-        for component in fit.components:
+        # of a parameter that the axes share, the value on the strongest comes last and stays
+        for component in sorted(fit.components, key=lambda component: component.evidence_nats):
             if component.variant.columns[:1] == ("any",):
                 continue
             mean, covariance, ends, nuisance, (best, variant) = average_sizes(

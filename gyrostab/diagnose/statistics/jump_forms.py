@@ -142,9 +142,7 @@ def _evidence_in_scatter(component: Component, state: State) -> float:
     )
     likely = jump[int(with_jump.argmax())]
     size, covariance = likely.moments()
-    wide = max(abs(float(size[0])), float(np.sqrt(covariance[0, 0]))) * float(
-        np.ptp(component.variant.design)
-    )
+    wide = max(abs(float(size[0])), float(np.sqrt(covariance[0, 0])))
     return float(np.logaddexp.reduce(with_jump) - np.logaddexp.reduce(without) - np.log(wide) - 0.5)
 
 

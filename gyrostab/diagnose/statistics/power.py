@@ -226,7 +226,8 @@ def _changes_over_time(density: Array) -> bool:
 
 def _is_white_and_constant(density: Array) -> bool:
     """Return whether a density is white and constant: a change of N, which is free."""
-    return bool(np.ptp(with_axis(density)) <= 1e-6 * np.abs(density).max(initial=0.0))
+    rows = with_axis(density)
+    return bool((np.ptp(rows, axis=(1, 2)) <= 1e-6 * np.abs(rows).max(axis=(1, 2))).all())
 
 
 def parts_of_record(component: Component, state: State) -> Iterator[Competitor]:

@@ -438,3 +438,22 @@ def test_expected_powers_are_the_quadratic_form_of_the_covariance(size):
     expected = np.array(expected).T / np.array(expected)[:, 1]
     made = expected_powers(weights, rate, ordinates(size))
     np.testing.assert_allclose(made / made[1], expected, rtol=1e-9)
+
+
+def test_a_stretch_without_noise_is_refused():
+    rates = np.random.default_rng(1).standard_normal((2, 6000))
+    rates[1, :2000] = 0.0
+    blocks = reduce_log(make_log(rates, rate=10.0, unit="deg/h"))
+    with pytest.raises(SchemaError, match="axis y: the quiescent blocks hold noise in 0 bands"):
+        calibrate_noise(blocks, quiet=(0, 190))
+
+
+def test_the_order_of_the_axes_does_not_matter():
+    rates = np.random.default_rng(2).standard_normal((3, 6000))
+    forth, back = (
+        calibrate_noise(reduce_log(log.isel(axis=order)))
+        for log in [make_log(rates, rate=10.0, unit="deg/h")]
+        for order in ([0, 1, 2], [2, 1, 0])
+    )
+    for name in ("square", "mean_variance", "grid_K", "grid_B", "posterior"):
+        np.testing.assert_array_equal(back[name].sel(axis=["x", "y", "z"]), forth[name])

@@ -11,12 +11,16 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
+from gyrostab.diagnose.identify import withdrawal
 from gyrostab.diagnose.identify.examination import Examination, nuisance_alternatives
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.identify.selection import _select_all
 from gyrostab.diagnose.identify.withdrawal import variance_fluctuation
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import refit_weights
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
 from tests.support.named import name_effects, nulls
 
@@ -41,6 +45,29 @@ def fluctuation_left(blocks: xr.Dataset, *columns: np.ndarray) -> float:
     return variance_fluctuation(
         refit_weights(state.with_columns("power", "x", spread)) if columns else state, "x"
     )
+
+
+def test_noise_that_fluctuates_on_one_axis_stays_named_on_the_others(monkeypatch):
+    blocks = reduce_log(
+        make_log(np.random.default_rng(2).standard_normal((3, 6000)), rate=10.0, unit="deg/h")
+    )
+    start = initial_state(blocks, calibrate_noise(blocks))
+    white = Variant({}, ("white",), np.ones((1, 1, *start.weight.shape[1:])), squared=True)
+    candidate = Candidate("vibration_noise", find_statistic("power"), ("vibration",), (white,))
+    components = tuple(
+        Component(candidate, white, (axis,), nats)
+        for axis, nats in (("x", 30.0), ("y", 100.0), ("z", 100.0))
+    )
+    selection = Selection("vibration_noise", ("vibration",), ("x", "y", "z"), components, 227.0, 8)
+    monkeypatch.setattr(
+        withdrawal, "variance_fluctuation", lambda state, axis: 40.0 if axis == "x" else 0.0
+    )
+    examination = Examination(
+        [], fold_blocks(blocks), CountEvidence({}), 8.0, start, (), np.zeros(1), {}
+    )
+    remaining, _ = withdrawal.withdraw_effects(examination, [selection], [])
+    assert [item.axes for item in remaining] == [("y", "z")]
+    assert remaining[0].evidence_nats == pytest.approx(198.5)  # 1.5 nats for the second axis
 
 
 @pytest.mark.parametrize("gaps", [False, True])

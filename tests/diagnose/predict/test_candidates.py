@@ -310,3 +310,14 @@ def test_nuisance_alternatives_have_the_axes_of_the_record(plain):
     assert "cross_spectrum" not in {
         alternative.statistic.name for alternative in nuisance_alternatives(single_axis)
     }
+
+
+def test_a_constant_white_level_is_no_candidate_on_several_axes():
+    """Lost samples add white noise at a constant level, whatever the N of each axis."""
+    held = [
+        known
+        for known in effect_candidates(record([]), COEFFICIENT)[0]
+        if known.effect == "held_samples"
+    ]
+    assert held
+    assert not any(known.statistic.is_power for known in held)

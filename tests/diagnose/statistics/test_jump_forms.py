@@ -11,16 +11,19 @@ from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.split_components import split_steps
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.identifiability import find_equivalent_effects, keep_physical
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
-from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.diagnose.predict.sizes import component_mixture, mean_mixture
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.tables import effect_tables
+from gyrostab.diagnose.statistics.base import SizeFit
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.diagnose.statistics.jump_forms import is_free_jump
 from gyrostab.ingest.make_log import make_log
+from gyrostab.simulate import simulate
 from tests.support.candidates import find_components, winning_forms
 from tests.support.named import name_effects, nulls
 from tests.support.repetitions import first_of
@@ -40,6 +43,33 @@ def try_jumps(blocks: xr.Dataset, baseline: xr.Dataset) -> tuple[Candidate, Stat
         if (candidate.effect, candidate.statistic.name) == ("bias_jump", "mean")
     )
     return jumps, initial_state(blocks, baseline)
+
+
+def test_time_of_a_jump_is_that_of_the_axis_that_shows_it_best():
+    rng = np.random.default_rng(5)
+    after = np.arange(6000) / 10.0 > 300.0
+    rates = 0.57 * rng.standard_normal((2, 6000)) + np.outer([2.0, 0.16], after)
+    blocks = reduce_log(make_log(rates, rate=10.0, unit="deg/h"))
+    jumps, state = try_jumps(blocks, calibrate_noise(blocks, quiet=(0, 250)))
+    (components,) = find_components([jumps], state).values()
+    assert components[0].evidence_nats > components[1].evidence_nats + 100.0
+    fit = SizeFit(components, ("x", "y"), state, (), CountEvidence({}))
+    at, error, *_ = jumps.statistic.estimate(fit)["at"]
+    assert at == pytest.approx(300.0, abs=5.0)
+    assert error < 5.0
+
+
+@pytest.mark.parametrize("unit", [0.01, 1.0, 100.0])
+def test_evidence_over_error_does_not_depend_on_the_unit_of_a_course(unit):
+    """A prior that is uniform in size over standard error has no unit."""
+    blocks = reduce_log(simulate(MODEL, duration="10min", rate=10.0, seed=3))
+    state = initial_state(blocks, calibrate_noise(blocks))
+    course = np.sin(np.arange(blocks.sizes["block"]) / 5.0)
+    in_unit = [mean_mixture(state, "x", [scale * course]) for scale in (1.0, unit)]
+    plain, scaled = (
+        mixture.evidence - 0.5 * np.log(mixture.moments()[1][0, 0]) for mixture in in_unit
+    )
+    assert scaled == pytest.approx(plain, abs=1e-6)
 
 
 @pytest.mark.slow
