@@ -3,16 +3,15 @@
     python benchmarks/settings_derivations.py [--records 400]
 
 Prints, for the shortest and the longest blocks, how often white noise alone exceeds `noisy_sigma`,
-`excess_sigma`, `known_line_sigma` and `line_nats`, and which vibrations
-exceed `level_correlation`. The powers of white noise are gamma distributed with as many degrees of
-freedom as a band has lines, so that all but `line_nats` follow in closed form.
+`excess_sigma`, `known_line_sigma` and `line_nats`. The powers of white noise are gamma distributed
+with as many degrees of freedom as a band has lines, so that all but `line_nats` follow in closed
+form.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from page import machine, make_parser
-from scipy.optimize import brentq
 from scipy.stats import gamma
 
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
@@ -38,12 +37,6 @@ def largest_line(count: int, records: int, lines: int = 1000) -> np.ndarray:
     return np.asarray(line_evidence(power, weight).max(axis=(1, 2)))
 
 
-def level_correlation(lowest: float) -> float:
-    """Return the correlation of g and g^2 for g uniform from `lowest` to 1."""
-    g = np.linspace(lowest, 1.0, 100_001)
-    return float(np.corrcoef(g, g**2)[0, 1])
-
-
 def main() -> None:
     """Print the probabilities."""
     parser = make_parser(__doc__, has_page=False)
@@ -64,8 +57,6 @@ def main() -> None:
             f"- line_nats: largest of 1000 lines {best[-1]:.2f} nats in {records} records, "
             f"95 % below {np.quantile(best, 0.95):.2f}"
         )
-    lowest = brentq(lambda low: level_correlation(low) - DEFAULTS.level_correlation, 0.0, 0.5)
-    print(f"- level_correlation: that of g uniform from {lowest:.3f} to 1")
 
 
 if __name__ == "__main__":

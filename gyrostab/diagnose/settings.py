@@ -129,13 +129,6 @@ class Settings:
         "Correlation of the errors of two terms above which the data do not separate them.",
         "standard errors grow by 1 / sqrt(1 - r^2) = 22 over those of one term",
     )
-    level_correlation: float = _make_setting(
-        0.97,
-        "1",
-        "Correlation of g and g^2 above which the vibration has one level.",
-        "that of g uniform from 1.5 % of its largest value up; sqrt(15) / 4 = 0.968 from zero "
-        "(benchmarks/settings_derivations.py)",
-    )
     fast_blocks: float = _make_setting(
         2.0,
         "block",

@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import mean_columns
@@ -238,10 +239,10 @@ def find_equivalent_effects(
     if effect == "vibration_rectification":
         vibration = blocks[f"channel_{components[0].candidate.driver[0]}"].values
         good = np.isfinite(vibration)
-        if (
-            np.corrcoef(vibration[good], vibration[good] ** 2)[0, 1]
-            > state.settings.level_correlation
-        ):
+        correlation = np.corrcoef(vibration[good], vibration[good] ** 2)[0, 1]
+        # what a bias in proportion to g explains less than one in proportion to g^2
+        lost_nats = (1.0 - correlation**2) * sum_evidence(components)
+        if lost_nats < state.settings.ambiguous_nats:
             out.append("g_sensitivity")
     return out
 

@@ -19,6 +19,7 @@ from gyrostab.diagnose.identify.examination import prepare_examination
 from gyrostab.diagnose.identify.identifiability import (
     _is_possible,
     distance_to_range,
+    find_equivalent_effects,
     keep_physical,
     passes_time_shift_test,
 )
@@ -154,6 +155,22 @@ def test_a_size_is_impossible_only_beyond_its_error(
     monkeypatch.setattr(identifiability, "component_mixture", lambda component, state: mixture)
     state = SimpleNamespace(settings=Settings())
     assert _is_possible(Component(candidate, variant, ("x",), 50.0), state) == answer
+
+
+@pytest.mark.parametrize(
+    ("levels", "nats", "is_open"),
+    [([0.0, 5.0], 1000.0, True), ([0.0, 2.0, 5.0], 200.0, False), ([0.0, 2.0, 5.0], 20.0, True)],
+)
+def test_g_and_its_square_are_separated_by_what_one_explains_less(levels, nats, is_open):
+    """Of g and g^2 at 0, 2 and 5 g, 0.066 of the variance of one is not in the other."""
+    candidate = Candidate("vibration_rectification", find_statistic("mean"), ("vibration",), ())
+    component = Component(
+        candidate, Variant({}, ("sensitivity",), np.ones((1, 1, 3))), ("x",), nats
+    )
+    blocks = {"channel_vibration": xr.DataArray(np.repeat(levels, 4))}
+    state = SimpleNamespace(settings=Settings(), blocks=blocks)
+    others = find_equivalent_effects("vibration_rectification", [component], state)
+    assert ("g_sensitivity" in others) == is_open
 
 
 @pytest.mark.slow
