@@ -200,7 +200,9 @@ def _allowed_range(component: Component, column: str, state: State) -> tuple[flo
     if statistic.is_power:
         has_least = not variant.squared and len(variant.columns) == 1
         return item.low if has_least else -math.inf, math.inf
-    largest = min(largest_size(effect, state.settings), max(abs(item.low), abs(item.high)))
+    largest = largest_size(effect, state.settings)
+    if statistic.is_linear_in_means:
+        largest = min(largest, max(abs(item.low), abs(item.high)))
     return -largest, largest
 
 
