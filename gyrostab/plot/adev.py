@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gyrostab.allan.confidence import interval_limits
 from gyrostab.allan.variance import surface_columns, variance_name
-from gyrostab.errors import OptionError, SchemaError
+from gyrostab.errors import OptionError
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import (
     COLOURS,
@@ -128,8 +128,6 @@ def plot_adev(
 
 def _select_window(part: xr.Dataset, when: Any) -> int:
     time = part["time"].values.astype("datetime64[ns]")
-    if not time.size:
-        raise SchemaError("there is no window to draw: the time axis is empty")
     if when is None:
         coverage = part["window_coverage"].values
         best = (

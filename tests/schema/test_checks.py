@@ -170,7 +170,7 @@ def test_other_datasets_are_no_log(product: xr.Dataset) -> None:
     [
         (lambda p: p.isel(time=slice(None, None, -1)), r"not in the order of time.*sortby\('time'"),
         (lambda p: p.isel(time=[0, 0, 1, 2]), "occur twice"),
-        (lambda p: p.isel(time=slice(0, 0)), "has no window"),
+        (lambda p: p.isel(time=slice(0, 0)), "there is no window"),
         (lambda p: p.drop_vars("time_bounds"), "no 'time_bounds'"),
     ],
 )
