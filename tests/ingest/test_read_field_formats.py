@@ -206,6 +206,17 @@ def test_items_of_wits_are_channels(tmp_path: Path) -> None:
     assert {column.name for column in scan_file(path).columns} >= {"0110", "0921"}
 
 
+@pytest.mark.parametrize(("time", "read"), [("930", "00:09:30"), ("1500", "00:15:00")])
+def test_dates_and_times_of_wits_may_lack_leading_zeros(
+    tmp_path: Path, time: str, read: str
+) -> None:
+    path = tmp_path / "rig.wits"
+    path.write_text(f"&&\n010590501\n0106{time}\n01221.5\n!!\n&&\n010590501\n01222.5\n!!\n")
+    raw = read_log(path, map={"0122": "gyro_x [deg/h]"})
+    expected = [np.datetime64(f"2009-05-01T{read}"), np.datetime64("NaT")]
+    np.testing.assert_array_equal(raw.time, np.array(expected, "datetime64[ns]"))
+
+
 @pytest.mark.parametrize("index", ["measured depth", "elapsed time"])
 def test_witsml_over_anything_but_dates_is_refused(tmp_path: Path, index: str) -> None:
     made = write_witsml(tmp_path)

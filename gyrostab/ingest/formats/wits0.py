@@ -36,7 +36,7 @@ def _read_records(path: Path, options: ReadOptions) -> TablesOfFile:
         while line := file.readline(_LONGEST_LINE):
             if line.startswith(("&&", "!!")):
                 for record, values in frame.items():
-                    stamp = _parse_stamp(values.pop("05", "") + values.pop("06", ""))
+                    stamp = _parse_stamp(values.pop("05", ""), values.pop("06", ""))
                     numbers = {record + item: _parse_number(text) for item, text in values.items()}
                     records.setdefault(record, Messages()).add(stamp, numbers)
                 frame = {}
@@ -48,12 +48,13 @@ def _read_records(path: Path, options: ReadOptions) -> TablesOfFile:
 scan, read = make_reader("wits0", _read_records)
 
 
-def _parse_stamp(text: str) -> int:
+def _parse_stamp(day: str, time: str) -> int:
+    """Return the stamp of a date and a time, whole numbers that may lack leading zeros."""
     try:
-        date = datetime.strptime(text, "%y%m%d%H%M%S").replace(tzinfo=UTC)
+        date = datetime.strptime(f"{int(day):06d}{int(time):06d}", "%y%m%d%H%M%S")
     except ValueError:
         return NAT
-    return int(date.timestamp()) * 10**9
+    return int(date.replace(tzinfo=UTC).timestamp()) * 10**9
 
 
 def _parse_number(text: str) -> float:
