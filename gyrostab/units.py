@@ -50,7 +50,7 @@ _PLAIN: dict[tuple[str, str], tuple[str, float, float] | None] = {}
 _WORDS = {
     word: short
     for short, words in {
-        "deg": "degree degrees degs",
+        "deg": "degree degrees degs dega",
         "rad": "radian radians",
         "arcsec": "arcsecond arcseconds arcsecs asec",
         "s": "second seconds sec secs",

@@ -33,6 +33,8 @@ from tests.ingest.field_files import (
 )
 from tests.support.command_line import call
 
+START_OF_WITSML = np.datetime64("2026-05-01T08:00:00", "ns")
+
 
 @pytest.fixture(params=WRITERS, scope="module")
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Made:
@@ -232,6 +234,64 @@ def test_curves_of_witsml_have_separate_null_values(tmp_path: Path) -> None:
     assert np.array_equal(
         read_log(path).temperature.values[:3], [60.0, np.nan, 60.5], equal_nan=True
     )
+
+
+def read_small_witsml(folder: Path, *blocks: str, log: str = "", curves: str = "") -> Any:
+    """Read a WITSML log of these blocks of data, with elements of the log and of its curves."""
+    infos = "".join(
+        f"<logCurveInfo><mnemonic>{name}</mnemonic><unit>{unit}</unit>{more}</logCurveInfo>"
+        for (name, unit), more in zip(
+            {"TIME": "", "gyro_x": "dega/h", "temperature": "degC"}.items(),
+            curves.split() or [""] * 3,
+            strict=True,
+        )
+    )
+    path = folder / "log.xml"
+    path.write_text(
+        '<?xml version="1.0"?><logs xmlns="http://www.witsml.org/schemas/1series"><log><indexType>'
+        f"date time</indexType><indexCurve>TIME</indexCurve>{log}{infos}"
+        + "".join(f"<logData>{block}</logData>" for block in blocks)
+        + "</log></logs>"
+    )
+    return read_log(path)
+
+
+def list_witsml(names: str, *rows: str) -> str:
+    """Return a block of data whose rows begin with the seconds of the index."""
+    names = f"<mnemonicList>{names}</mnemonicList>" if names else ""
+    return names + "".join(f"<data>2026-05-01T08:00:0{row}</data>" for row in rows)
+
+
+def test_blocks_of_witsml_have_separate_lists_of_curves(tmp_path: Path) -> None:
+    raw = read_small_witsml(
+        tmp_path,
+        list_witsml("TIME,gyro_x,temperature", "0,1,60", "1,2,61"),
+        list_witsml("TIME,temperature,gyro_x", "2,62,3"),
+        list_witsml("TIME,gyro_x", "3,4"),
+    )
+    assert (raw.time.values == START_OF_WITSML + np.arange(4) * np.timedelta64(1, "s")).all()
+    assert raw.rate[0].values.tolist() == [1, 2, 3, 4]
+    np.testing.assert_array_equal(raw.temperature, [60, 61, 62, np.nan])
+
+
+def test_curves_of_witsml_1_3_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    numbers = " ".join(f"<columnIndex>{number}</columnIndex>" for number in (1, 3, 2))
+    raw = read_small_witsml(tmp_path, list_witsml("", "0,60,1", "1,61,2"), curves=numbers)
+    assert raw.rate[0].values.tolist() == [1, 2]
+    assert raw.temperature.values.tolist() == [60, 61]
+
+
+def test_cells_of_witsml_are_separated_by_its_delimiter(tmp_path: Path) -> None:
+    block = list_witsml("TIME|gyro_x|temperature", "0|1|60", "1|2|61")
+    raw = read_small_witsml(tmp_path, block, log="<dataDelimiter>|</dataDelimiter>")
+    assert raw.rate[0].values.tolist() == [1, 2]
+
+
+def test_rows_of_witsml_with_too_many_cells_are_unreadable(tmp_path: Path) -> None:
+    block = list_witsml("TIME,gyro_x,temperature", "0,1,60", "1,2,61,9", "2,3,62,")
+    raw = read_small_witsml(tmp_path, block)
+    np.testing.assert_array_equal(raw.rate[0], [1, np.nan, 3])
+    assert raw.attrs["unreadable_rows"] == 1
 
 
 def test_accelerometers_of_ardupilot_are_channels_without_imu_messages(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ Energistics, WITSML data schema 1.4.1.1, object log.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,10 @@ from gyrostab.ingest.columns.stamps import texts_to_ns
 from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, make_reader
 from gyrostab.ingest.options import ReadOptions
+from gyrostab.ingest.text.layout import split_line
+
+#: Column of stamps, named as no curve is.
+_STAMPS = "\0time"
 
 matches = make_matcher(rb"(?is)(?:\xef\xbb\xbf)?\s*<.*witsml")  # an XML document
 
@@ -45,32 +50,65 @@ def _read_logs(path: Path, options: ReadOptions) -> TablesOfFile:
 def _make_table(log: Any) -> Table | None:
     if "date" not in _child_text(log, "indexType").lower():
         return None
-    curves = {_child_text(curve, "mnemonic"): curve for curve in log.iterfind(".//{*}logCurveInfo")}
-    lists = [names.text for names in log.iterfind(".//{*}mnemonicList") if names.text]
-    names = [name.strip() for name in lists[-1].split(",")] if lists else list(curves)
-    lines = [data.text.strip() for data in log.iterfind(".//{*}data") if data.text]
+    curves = {
+        _child_text(curve, "mnemonic"): curve
+        for curve in sorted(log.iterfind(".//{*}logCurveInfo"), key=_curve_place)
+    }
+    blocks = (_read_block(log, block, curves) for block in log.iterfind(".//{*}logData"))
+    filled = [block for block in blocks if block is not None]
+    if not filled:
+        return None
+    cells = pd.concat(filled, ignore_index=True)
+    columns = [
+        TableColumn((name,), cells[name].to_numpy(), _child_text(curves.get(name), "unit"))
+        for name in cells.columns.drop(_STAMPS)
+    ]
+    return Table(len(cells), columns, TableColumn(("time",), cells[_STAMPS].to_numpy()))
+
+
+def _curve_place(curve: Any) -> int:
+    """Return the position of a curve in the rows of version 1.3; 0 in 1.4, which gives none."""
+    number = _child_text(curve, "columnIndex")
+    return int(number) if number.isdecimal() else 0
+
+
+def _read_block(log: Any, block: Any, curves: Mapping[str, Any]) -> pd.DataFrame | None:
+    """Read a block of rows by its list of mnemonics, which may differ from that of another."""
+    delimiter = log.findtext("{*}dataDelimiter") or ","
+    delimiter = delimiter.strip() or delimiter[0]
+    listed = _child_text(block, "mnemonicList")
+    parts = listed.split("," if "," in listed else delimiter)
+    names = [name.strip() for name in parts] if listed else list(curves)
+    texts = (data.text or "" for data in block.iterfind("{*}data"))
+    lines = [line.strip() for text in texts for line in text.split("\n") if line.strip()]
     if not lines or not names:
         return None
-    cells = pd.read_csv(  # type: ignore[call-overload]
-        StringIO("\n".join(lines)),
+    missing: dict[Any, list[str]] = {
+        number: [_child_text(curves.get(name), "nullValue") or _child_text(log, "nullValue")]
+        for number, name in enumerate(names)
+    }
+    cells = pd.read_csv(
+        StringIO("\n".join(_fit_row(line, delimiter, len(names)) for line in lines)),
+        sep=delimiter,
         header=None,
         names=range(len(names)),
         index_col=False,
-        na_values={
-            number: [_child_text(curves.get(name), "nullValue") or _child_text(log, "nullValue")]
-            for number, name in enumerate(names)
-        },
-        on_bad_lines="skip",
-    )
+        na_values=missing,
+        skip_blank_lines=False,  # those in place of too many cells are unreadable
+    ).set_axis(names, axis="columns")
     index = _child_text(log, "indexCurve")
-    place = names.index(index) if index in names else 0
-    stamps = texts_to_ns(cells[place].astype(str).tolist()).view("datetime64[ns]")
-    columns = [
-        TableColumn((name,), cells[number].to_numpy(), _child_text(curves.get(name), "unit"))
-        for number, name in enumerate(names)
-        if number != place
-    ]
-    return Table(len(cells), columns, TableColumn(("time",), stamps))
+    stamps = cells.pop(index if index in names else names[0]).astype(str).tolist()
+    return cells.assign(**{_STAMPS: texts_to_ns(stamps).view("datetime64[ns]")})
+
+
+def _fit_row(line: str, delimiter: str, width: int) -> str:
+    """Return a row without a delimiter at its end; an empty one in place of too many cells."""
+    fitting = (
+        text
+        for text in (line, line.removesuffix(delimiter))
+        if len(split_line(text, delimiter)) <= width
+    )
+    return next(fitting, "")
 
 
 def _child_text(parent: Any, name: str) -> str:
