@@ -47,6 +47,23 @@ def test_rotation_channels_of_miniseed_are_axes(tmp_path: Path, codes: str, band
     assert mapped.axis.values.tolist() == ["w"]
 
 
+@pytest.mark.parametrize(("late_us", "period_us"), [(900, 20018), (1, 20000)])
+def test_stamps_of_miniseed_follow_those_of_its_records(
+    tmp_path: Path, late_us: int, period_us: float
+) -> None:
+    """Records of 50 samples, each later than the nominal rate says: by 900 us, or by rounding."""
+    path = tmp_path / "a.mseed"
+    with path.open("wb") as file:
+        for number in range(20):
+            start = START + np.timedelta64(number * (50 * 20_000 + late_us), "us")
+            values = VALUES[0, 50 * number : 50 * number + 50]
+            write_trace(file, "H_J_Z", values, RATE, start, format_version=2)
+    raw = read_log(path, unit={"gyro": "0.5 deg/h"})
+    assert np.array_equal(raw.rate[0].values, VALUES[0, :1000] * 0.5)
+    late = (raw.time - (START + np.arange(1000) * np.timedelta64(period_us, "us"))).values
+    assert np.abs(late).max() <= np.timedelta64(late_us, "us")  # the last record ends on time
+
+
 @pytest.mark.parametrize("cut", [1, 100, 470, 511, 512, 900])
 def test_truncated_miniseed_keeps_its_complete_records(tmp_path: Path, cut: int) -> None:
     whole, path = tmp_path / "a.mseed", tmp_path / "b.mseed"

@@ -25,19 +25,33 @@ _HEAD = rb"\d{6}[DRQM][ \0]|MS\x03"  # versions 2 and 3
 _MAX_RECORD_BYTES = 2**20  # version 2 allows longer records, which nobody writes
 _ROTATION = re.compile(r"[A-Z]J([A-Z0-9])")  # band, instrument J, orientation: SEED, appendix A
 _MAX_START_DIFFERENCE = 0.1  # of channels that share their stamps [samples]
+_RESOLUTION_NS = 100_000  # of the stamps of records of version 2
 
 matches = make_matcher(_HEAD, ".mseed", ".miniseed", ".msd", ".ms", ".mseed3")
 
 
 @dataclass
 class _Trace:
-    """Unbroken segments of one channel: first stamps [ns], rate [Hz], sizes, values if loaded."""
+    """Unbroken segments of one channel: nominal rate [Hz], sizes, values if loaded.
+
+    The stamps of the first and last samples [ns] give the period of each segment: the clock of a
+    recorder differs from the nominal rate, and each record has a stamp.
+    """
 
     name: tuple[str, ...]
     rate: float
     starts: list[int] = field(default_factory=list)
+    ends: list[int] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
     values: list[NDArray[Any]] = field(default_factory=list)
+
+    @property
+    def delays(self) -> NDArray[np.float64]:
+        """Period less the nominal one of each segment [ns], 0 if they agree to the resolution."""
+        last = np.array(self.sizes) - 1
+        late = np.array(self.ends) - self.starts - grid_times(0, self.rate, last)
+        late = np.where(np.abs(late) <= _RESOLUTION_NS, 0, late)
+        return np.asarray(late / np.maximum(last, 1), dtype=np.float64)
 
 
 def _make_tables(path: Path, options: ReadOptions, *, unpack: bool) -> TablesOfFile:
@@ -81,6 +95,7 @@ def _read_traces(path: Path, *, unpack: bool) -> list[_Trace]:
                 (trace.sourceid, piece.samprate), _Trace(tuple(code), piece.samprate)
             )
             channel.starts.append(int(piece.starttime))
+            channel.ends.append(int(piece.endtime))
             channel.sizes.append(int(piece.samplecnt))
             if unpack:
                 channel.values.append(np.array(piece.np_datasamples))
@@ -118,9 +133,11 @@ def _in_step(first: _Trace, second: _Trace) -> bool:
         and first.sizes[:-1] == second.sizes[:-1]
         and len(first.sizes) == len(second.sizes)
     )
-    return same and all(
-        abs(a - b) <= apart for a, b in zip(first.starts, second.starts, strict=True)
-    )
+    if not same:
+        return False
+    sizes = np.minimum(first.sizes, second.sizes)
+    starts, ends = np.array(first.starts) - second.starts, (first.delays - second.delays) * sizes
+    return bool((np.abs(starts) <= apart).all() and (np.abs(starts + ends) <= apart).all())
 
 
 def _join_values(pieces: list[NDArray[Any]], rows: int) -> NDArray[Any]:
@@ -131,15 +148,14 @@ def _join_values(pieces: list[NDArray[Any]], rows: int) -> NDArray[Any]:
 
 
 def _trace_stamps(trace: _Trace) -> Callable[[int, int], Any]:
-    ends = np.cumsum(trace.sizes)
+    ends, delays = np.cumsum(trace.sizes), trace.delays
 
     def part(start: int, stop: int) -> NDArray[np.datetime64]:
         rows = np.arange(start, min(stop, int(ends[-1])))
         piece = np.searchsorted(ends, rows, side="right")
-        first = (ends - trace.sizes)[piece]
-        stamps: NDArray[np.datetime64] = (
-            np.array(trace.starts)[piece] + grid_times(0, trace.rate, rows - first)
-        ).view("datetime64[ns]")
-        return stamps
+        index = rows - (ends - trace.sizes)[piece]
+        late = np.rint(index * delays[piece]).astype(np.int64)
+        stamps = np.array(trace.starts)[piece] + grid_times(0, trace.rate, index) + late
+        return np.asarray(stamps.view("datetime64[ns]"))
 
     return part
