@@ -147,7 +147,7 @@ def as_iso(text: str, order: str) -> str | None:
             short = match["name"][:3].lower()
             month = str(_MONTHS.index(short) + 1) if short in _MONTHS else "0"
             year = f"20{match['short']}"[-4:]
-        elif order == MONTH_FIRST and match["between"] != ".":
+        elif order == MONTH_FIRST:
             day, month = month, day
         elif order == YEAR_FIRST:
             return None
