@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -196,6 +197,13 @@ def test_cells_in_any_order_give_the_same_stamp(stamp, mark, order):  # type: ig
     assert cells_to_ns([cell], None, 0, order)[0] == expected
     by_form = DAY_FIRST if mark == "." and order == MONTH_FIRST else order  # nobody gives the order
     assert find_order([cell]) in (by_form, None)
+
+
+@pytest.mark.parametrize("year", [1969, 1998, 2000, 2068])
+def test_years_of_two_digits_are_those_of_strptime(year: int) -> None:
+    cell = f"14-Mar-{year % 100:02d}"
+    assert as_iso(cell, DAY_FIRST) == f"{datetime.strptime(cell, '%d-%b-%y'):%Y-%m-%d}"
+    assert as_iso(cell, DAY_FIRST) == f"{year}-03-14"
 
 
 @pytest.mark.parametrize("cell", ["31.02.2026", "2026/13/01", "1.5.2026 13:00 PM", "5 Mei 2026"])

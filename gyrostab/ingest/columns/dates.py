@@ -32,6 +32,8 @@ _DATE = re.compile(
 _TIME_OF_DAY = re.compile(rf"^\s*{_CLOCK}\s*(?:[AaPp][Mm])?\s*$")
 _ZONE_NAME = re.compile(r"^(.*:\d\d(?:[.,]\d+)?(?:\s*[AaPp][Mm])?)\s*[A-Za-z][A-Za-z/_]+\s*$")
 _OFFSET = re.compile(r":\d\d(?:[.,]\d+)?\s*(?:Z|[+-]\d\d(?::?\d\d)?)\s*$")
+#: Years of two digits from this one on are of the 20th century, as in POSIX and `datetime`.
+_FIRST_SHORT_YEAR = 69
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 
 
@@ -146,7 +148,9 @@ def as_iso(text: str, order: str) -> str | None:
         if match["name"]:
             short = match["name"][:3].lower()
             month = str(_MONTHS.index(short) + 1) if short in _MONTHS else "0"
-            year = f"20{match['short']}"[-4:]
+            year = match["short"]
+            if len(year) == 2:
+                year = f"{'19' if int(year) >= _FIRST_SHORT_YEAR else '20'}{year}"
         elif order == MONTH_FIRST:
             day, month = month, day
         elif order == YEAR_FIRST:
