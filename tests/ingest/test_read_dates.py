@@ -174,6 +174,44 @@ def test_name_of_a_zone_is_refused(tmp_path: Path, header: str, options: dict[st
         read_log(path, **options)
 
 
+@pytest.mark.parametrize(
+    ("header", "unit", "hours"),
+    [
+        ("time [UTC+02:00]", None, -2),
+        ('"Date Time, GMT-05:30"', None, 5.5),
+        ("time [UTC]", None, 0),
+        ("Timestamp (CEST)", "UTC+2", -2),
+        ("time [UTC+02:00]", "UTC", 0),
+        ("time", "YYYY-MM-DD GMT+02:00", -2),
+    ],
+)
+def test_offset_in_a_header_holds_for_times_without_one(
+    tmp_path: Path, header: str, unit: str | None, hours: float
+) -> None:
+    path = write(tmp_path / "log.csv", "%Y-%m-%d %H:%M:%S.%f", f"{header},gyro_x [deg/h]")
+    slow_row = path.read_text().replace(",-3\n", ",-3D0\n", 1)  # which the kernel leaves
+    path.write_text(slow_row)
+    options = {} if unit is None else {"unit": {"time": unit}}
+    expected = STAMPS + pd.Timedelta(hours=hours)
+    np.testing.assert_array_equal(stamps_of(read_log(path, **options)), expected.values)
+    ends = scan(path, **options)[["start", "end"]].to_numpy()[0]
+    assert [*ends] == [expected[0], expected[-1]]
+
+
+def test_offset_in_a_cell_overrules_that_in_the_header(tmp_path: Path) -> None:
+    header = "time [UTC+02:00],gyro_x [deg/h]"
+    path = write(tmp_path / "log.csv", "%Y-%m-%dT%H:%M:%S.%f+01:00", header)
+    expected = STAMPS - pd.Timedelta(hours=1)
+    np.testing.assert_array_equal(stamps_of(read_log(path)), expected.values)
+
+
+@pytest.mark.parametrize("header", ["Timestamp (CEST)", "time [Europe/Oslo]", "time EST"])
+def test_name_of_a_zone_in_a_header_is_refused(tmp_path: Path, header: str) -> None:
+    path = write(tmp_path / "log.csv", "%Y-%m-%d %H:%M:%S.%f", f"{header},gyro_x [deg/h]")
+    with pytest.raises(UnitError, match=r"names the time zone .*--unit time=UTC-06:00"):
+        read_log(path)
+
+
 def test_times_of_day_alone_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UnitError, match=r"'time' holds times of day without a date"):
         read_log(write(tmp_path / "log.csv", "%H:%M:%S.%f"))

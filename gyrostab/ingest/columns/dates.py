@@ -32,6 +32,14 @@ _DATE = re.compile(
 _TIME_OF_DAY = re.compile(rf"^\s*{_CLOCK}\s*(?:[AaPp][Mm])?\s*$")
 _ZONE_NAME = re.compile(r"^(.*:\d\d(?:[.,]\d+)?(?:\s*[AaPp][Mm])?)\s*[A-Za-z][A-Za-z/_]+\s*$")
 _OFFSET = re.compile(r":\d\d(?:[.,]\d+)?\s*(?:Z|[+-]\d\d(?::?\d\d)?)\s*$")
+#: Offset from UTC in a header, ``UTC+02:00``, and the name of a time zone at its end.
+_HEADER_OFFSET = re.compile(
+    r"(?<![A-Za-z/])(?:UTC|GMT)(?:\s?(?P<sign>[+-])(?P<hours>\d\d?)(?::?(?P<minutes>\d\d))?)?(?!\w)"
+)
+_HEADER_ZONE = re.compile(
+    r"[\[(,_ ]((?:[A-Z]{1,2}[SD]|[CEW]E|[CEMP])T|MSK"
+    r"|(?:Africa|America|Asia|Atlantic|Australia|Europe|Indian|Pacific|US)/\w+)[\])]?\s*$"
+)
 #: Years of two digits from this one on are of the 20th century, as in POSIX and `datetime`.
 _FIRST_SHORT_YEAR = 69
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
@@ -79,6 +87,33 @@ def names_zone(text: str) -> bool:
     """
     match = None if holds_date(text) else _ZONE_NAME.match(text)
     return match is not None and holds_date(match[1])
+
+
+def find_offset(header: str) -> int | None:
+    """Return the offset from UTC that a header names [ns]; None without one.
+
+    Examples
+    --------
+    >>> [find_offset(text) for text in ("Date Time, GMT-05:30", "time [UTC+2]", "time_UTC", "Time")]
+    [-19800000000000, 7200000000000, 0, None]
+    """
+    match = _HEADER_OFFSET.search(header.replace("_", " "))
+    if match is None:
+        return None
+    minutes = 60 * int(match["hours"] or 0) + int(match["minutes"] or 0)
+    return minutes * 60 * 10**9 * (-1 if match["sign"] == "-" else 1)
+
+
+def find_zone_name(header: str) -> str | None:
+    """Return the name of a time zone at the end of a header, other than that of UTC.
+
+    Examples
+    --------
+    >>> [find_zone_name(text) for text in ("Timestamp (CEST)", "time Europe/Oslo", "Date/Time")]
+    ['CEST', 'Europe/Oslo', None]
+    """
+    match = _HEADER_ZONE.search(header)
+    return match[1] if match else None
 
 
 def find_order(cells: Iterable[str]) -> str | None:

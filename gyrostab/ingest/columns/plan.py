@@ -56,7 +56,9 @@ class Column:
     offset: float = 0.0
     time_unit: TimeUnit | None = None
     date_order: str = YEAR_FIRST  # of stamps that are text
-    epoch: int = 0  # of numbers whose unit names none [ns since 1970]
+    #: Zero of numbers whose unit names none, and the beginning of 1970 in the zone of dates [ns
+    #: since 1970].
+    epoch: int = 0
 
 
 @dataclass

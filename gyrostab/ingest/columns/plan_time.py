@@ -12,6 +12,9 @@ from gyrostab.ingest.columns.dates import (
     NAMED_ZONE,
     NO_DATE,
     YEAR_FIRST,
+    find_offset,
+    find_zone_name,
+    has_offset,
     parse_order,
 )
 from gyrostab.ingest.columns.headers import (
@@ -47,10 +50,9 @@ def find_time(plan: Plan, named: list[Header]) -> Header | None:
         named[:] = [c for c in named if c not in rivals]
     unit = None if column.file.stamped else _time_unit(plan, column)
     order = _date_order(plan, column) if column.file.stamped else YEAR_FIRST
+    epoch = -_find_offset(plan, column) if column.file.stamped else plan.options.epoch_ns
     planned = column.source, column.header, "time", "time", "ns"
-    plan.columns.append(
-        Column(*planned, time_unit=unit, date_order=order, epoch=plan.options.epoch_ns)
-    )
+    plan.columns.append(Column(*planned, time_unit=unit, date_order=order, epoch=epoch))
     written = unit.text if unit else None
     if column.file.stamped:
         written = "ISO 8601" if order == YEAR_FIRST else order
@@ -152,6 +154,31 @@ def _date_order(plan: Plan, column: Header) -> str:
             f"number is the day: --unit time={DAY_FIRST} or --unit time={MONTH_FIRST}",
         )
     return order or EITHER_FIRST
+
+
+def _find_offset(plan: Plan, column: Header) -> int:
+    """Return the offset from UTC of dates without one [ns]: from the user or the header."""
+    cells = column.file.cells
+    if not cells or any(map(has_offset, cells)):
+        return 0
+    key = plan.unit_key([column.name, column.key, column.header, "time"])
+    given = None if key is None else find_offset(plan.options.unit[key])
+    if key is not None and given is not None:
+        plan.used_units.add(key)
+        return given
+    offset, zone = find_offset(column.header), find_zone_name(column.header)
+    if offset:
+        plan.notes.append(
+            f"the times are read with the offset from UTC that the header {column.header!r} names; "
+            "for UTC give --unit time=UTC"
+        )
+    elif offset is None and zone is not None:
+        plan.refuse(
+            UnitError,
+            f"the header of the time column {column.header!r} names the time zone {zone}; give its "
+            "offset from UTC, for instance --unit time=UTC-06:00",
+        )
+    return offset or 0
 
 
 def _time_unit(plan: Plan, column: Header) -> TimeUnit | None:

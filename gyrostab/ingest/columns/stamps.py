@@ -84,6 +84,10 @@ class TimeUnit:
         return next((n for n in range(13) if self.ns == 10**n), None)
 
 
+#: Unit of stamps.
+NANOSECOND = TimeUnit("ns", Fraction(1))
+
+
 def names_epoch(text: str) -> bool:
     """Return whether a unit counts from an epoch, such as ``seconds since 1970-01-01``."""
     return bool(_SINCE.search(text))
@@ -225,10 +229,13 @@ def cells_to_ns(
 ) -> NDArray[np.int64]:
     """Convert text cells to stamps, exact to the last decimal: numbers of `unit`, or dates.
 
-    `order` is that of day, month and year in dates that are not ISO 8601.
+    `order` is that of day, month and year in dates that are not ISO 8601, and `epoch` the beginning
+    of 1970 in the zone of dates [ns since 1970].
     """
     if unit is None:
-        return texts_to_ns([as_iso(cell, order) for cell in cells])
+        return integers_to_ns(
+            texts_to_ns([as_iso(cell, order) for cell in cells]), NANOSECOND, epoch
+        )
     zero = epoch if unit.epoch is None else unit.epoch
     stamps = np.full(len(cells), NAT, dtype=np.int64)
     for index, cell in enumerate(cells):

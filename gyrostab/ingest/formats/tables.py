@@ -282,7 +282,7 @@ def _add_clock(plan: Plan, source: int, described: Sequence[FileColumn], *, is_n
     own, time = described[source], plan.time
     if (time is None and is_named) or any(column.source == source for column in plan.of("time")):
         return  # the user leaves out the stamps, or they are planned
-    planned = Column(source, own.header, "time", "time", "ns", epoch=plan.options.epoch_ns)
+    planned = Column(source, own.header, "time", "time", "ns")
     if time is not None and replace(described[time.source], header="") == replace(own, header=""):
         planned = replace(time, source=source)
     elif own.unit is not None:
@@ -291,7 +291,7 @@ def _add_clock(plan: Plan, source: int, described: Sequence[FileColumn], *, is_n
         except UnitError as error:
             plan.refuse(UnitError, str(error))
             return
-        planned = replace(planned, time_unit=unit)
+        planned = replace(planned, time_unit=unit, epoch=plan.options.epoch_ns)
     plan.columns.append(planned)
 
 

@@ -108,7 +108,7 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
     raw = builder.finish(layout.notes)
     if dates is not None:
         cells = [row[dates.source] for row in layout.samples]
-        raw.attrs["local_time"] = not any(map(has_offset, cells))
+        raw.attrs["local_time"] = not (dates.epoch or any(map(has_offset, cells)))
     return raw
 
 

@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 from gyrostab.ingest.columns.dates import DAY_FIRST, YEAR_FIRST
 from gyrostab.ingest.columns.headers import VOID_CELLS
 from gyrostab.ingest.columns.plan import Plan
-from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, integers_to_ns, plain_number
+from gyrostab.ingest.columns.stamps import (
+    NANOSECOND,
+    NAT,
+    cells_to_ns,
+    integers_to_ns,
+    plain_number,
+)
 from gyrostab.ingest.text.layout import BLANK, Layout
 
 #: A minus sign as .NET and ICU write it in some languages, such as Norwegian and Swedish.
@@ -56,7 +62,7 @@ class BlockParser:
         self.time = plan.time.source if plan.time else None
         self.unit = plan.time.time_unit if plan.time else None
         #: Decimals of times that the kernel reads, and unit of the whole numbers that it returns.
-        self.digits, self.counted = 0, self.unit
+        self.digits, self.counted = 0, self.unit or NANOSECOND
         if self.unit is not None and (digits := self.unit.digits) is not None and digits <= 9:
             self.digits, self.counted = digits, replace(self.unit, ns=Fraction(1))
         self.order = plan.time.date_order if plan.time else YEAR_FIRST
@@ -100,7 +106,7 @@ class BlockParser:
                 row += 1
             at = end
         stamps = None if self.time is None else counts[:row]
-        if stamps is not None and self.counted is not None:
+        if stamps is not None:
             stamps = integers_to_ns(stamps, self.counted, self.epoch)
         words = self._parse_cells(other_lines, values, stamps) if other_lines else 0
         columns = dict(zip(self.sources, values[:, :row], strict=True))
