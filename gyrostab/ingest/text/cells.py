@@ -100,8 +100,8 @@ class BlockParser:
             end = block.index(b"\n", at) + 1
             if _MINUS_SIGN in block[at:end]:
                 return self.parse(block.replace(_MINUS_SIGN, b"-"))
-            line = block[at:end].decode("latin-1").split("#")[0].strip("\r\n")
-            if line.strip():
+            line = block[at:end].decode("latin-1").strip("\r\n")
+            if line.split("#")[0].strip():
                 other_lines[row], starts[row] = line, at
                 row += 1
             at = end
@@ -126,7 +126,7 @@ class BlockParser:
         faults = [source for source in self.sources if not np.isfinite(parsed.values[source][row])]
         if self.time is not None and parsed.stamps is not None and parsed.stamps[row] == NAT:
             faults.insert(0, self.time)
-        cells = self._split_row(line.split("#")[0]) or []
+        cells = self._split_row(line) or []
         filled = (cells[at] for at in faults if cells and cells[at].lower() not in VOID_CELLS)
         return repr(next(filled, line))
 

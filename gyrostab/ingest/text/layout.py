@@ -66,8 +66,9 @@ class Layout:
         return len(self.headers)
 
     def split_row(self, line: str) -> list[str]:
-        """Split a data row into cells."""
-        return _join_pair(split_line(line, self.separator), self.paired)
+        """Split a data row into cells, without a comment after it."""
+        width = self.width + (self.paired is not None)
+        return _join_pair(_split_data(line, self.separator, width), self.paired)
 
     @cached_property
     def _header_names(self) -> set[str]:
@@ -117,6 +118,16 @@ def split_line(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in line.split(separator)]
 
 
+def _split_data(line: str, separator: str, width: int) -> list[str]:
+    """Split a data row of a table; a comment begins with # after the last cell, not within one."""
+    cells = split_line(line, separator)
+    if "#" not in line:
+        return cells
+    if len(cells) != width:
+        return split_line(line.split("#")[0], separator)
+    return [*cells[:-1], cells[-1].split("#")[0].strip()]
+
+
 def find_layout(
     path: Path, head: bytes, *, complete: bool, limits: Mapping[str, float] | None = None
 ) -> Layout:
@@ -153,7 +164,10 @@ def find_layout(
             f"{path.name}: there is a header (line {content[0] + 1}) but no data row below it; "
             "copy it again"
         )
-    rows = [tuple(split_line(lines[index].split("#")[0], separator)) for index in data[:HEAD_LINES]]
+    head_lines = [lines[index] for index in data[:HEAD_LINES]]
+    whole_rows = [header] if header else [split_line(line, separator) for line in head_lines]
+    width = _commonest_width(whole_rows)
+    rows = [tuple(_split_data(line, separator, width)) for line in head_lines]
     paired = _find_pair(rows)
     if paired is not None:
         rows = [tuple(_join_pair(list(row), paired)) for row in rows]
@@ -337,7 +351,7 @@ def _find_header(
         following = [
             (_guess_separator(lines[i]), lines[i]) for i in content[place + 1 : place + 21]
         ]
-        rows = [(mark, split_line(line, mark)) for mark, line in following]
+        rows = [(mark, _split_data(line, mark, len(names))) for mark, line in following]
         solid = [(mark, row) for mark, row in rows if _is_data(row, comma=mark in COMMA_SEPARATORS)]
         widths = {len(row) for mark, row in solid or rows if mark == separator}
         if separator != BLANK and _precedes_header(names, separator, rows):
