@@ -149,8 +149,7 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
     columns = []
     for place, header in enumerate(layout.headers):
         cells = [row[place] for row in layout.samples]
-        if layout.decimal_comma:
-            cells = [c.replace(",", ".") if is_number(c, comma=True) else c for c in cells]
+        cells = [n if is_number(n := layout.write_point(cell)) else cell for cell in cells]
         unit = layout.units.get(place) or _duration_unit(cells)
         column = FileColumn(header, unit, cells=cells)
         if any(holds_date(cell) or is_time_of_day(cell) or names_zone(cell) for cell in cells):
@@ -169,8 +168,8 @@ def _sample_stamps(
     layout: Layout, time: Column, rows: Sequence[Sequence[str]]
 ) -> NDArray[np.int64]:
     cells = [row[time.source] for row in rows]
-    if layout.decimal_comma and time.time_unit is not None:
-        cells = [cell.replace(",", ".") for cell in cells]
+    if time.time_unit is not None:
+        cells = [layout.write_point(cell) for cell in cells]
     return cells_to_ns(cells, time.time_unit, time.epoch, time.date_order)
 
 
@@ -178,8 +177,7 @@ def _is_solid(row: list[str], layout: Layout, time: int) -> bool:
     """Return whether a row holds a number in addition to its stamp."""
     other_cells = (cell for at, cell in enumerate(row) if at != time)
     return len(row) == layout.width and (
-        layout.width == 1
-        or any(is_number(cell, comma=layout.decimal_comma) for cell in other_cells)
+        layout.width == 1 or any(is_number(layout.write_point(cell)) for cell in other_cells)
     )
 
 

@@ -87,7 +87,8 @@ class BlockParser:
         values = np.empty((len(self.sources), lines))
         counts, starts = np.empty(lines, np.int64), np.empty(lines, np.int64)
         separator = BLANKS if self.layout.separator == BLANK else ord(self.layout.separator)
-        point = ord("," if self.layout.decimal_comma and b"," in block else ".")
+        marks = self.layout.decimal_marks
+        point = ord(marks if len(marks) == 1 else "," if b"," in block else ".")
         other_lines: dict[int, str] = {}
         row = at = 0
         while True:
@@ -149,8 +150,7 @@ class BlockParser:
         if stamps is not None and self.time is not None:
             cells = ["" if row is None else row[self.time] for row in rows]
             if self.unit is not None:
-                if self.layout.decimal_comma:
-                    cells = [cell.replace(",", ".") for cell in cells]
+                cells = [self.layout.write_point(cell) for cell in cells]
                 # durations as MATLAB writes them
                 cells = [cell.strip().removesuffix(f" {self.unit.text}") for cell in cells]
             stamps[at] = cells_to_ns(cells, self.unit, self.epoch, self.order)
@@ -177,9 +177,8 @@ def decode_line(line: bytes) -> str:
 
 
 def _parse_number(cell: str, layout: Layout) -> float:
-    text = cell.replace(",", ".") if layout.decimal_comma else cell
     try:
-        value = float(plain_number(text))
+        value = float(plain_number(layout.write_point(cell)))
     except ValueError:
         return np.nan
     return np.nan if "_" in cell else value

@@ -32,6 +32,9 @@ _MIN_RECURRENCES, _MIN_CHANGING_SHARE = 4, 0.75
 _HEADER_CELLS = re.compile(r"(?:[^\s\[]+(?:\[[^\[\]]*\])?(?:[ \t]+\[[^\[\]]*\])?)")
 _DURATION = re.compile(r"^\s*[+-]?\d+(?:\.\d+)? (ms|s|sec|min|h|hr|d|day|days)\s*$")
 _COMMENT = re.compile(r"^\s*[#%]")
+#: The last three digits of a number, which a mark for thousands may precede.
+_THREE_DIGITS = re.compile(r"[.,]\d{3}$")
+_SWAPPED = str.maketrans(".,", ",.")
 #: Where commas do not separate cells: in brackets, and before the fraction of a second if blanks
 #: separate the cells.
 _WITHIN_CELL = re.compile(r"\[[^\[\]]*\]|(?<=:\d\d),(?=\d+[ \t]+[^\s,])")
@@ -50,7 +53,8 @@ class Layout:
     offset: int
     line: int
     samples: tuple[tuple[str, ...], ...]
-    decimal_comma: bool = False  # a comma in a number is its decimal point
+    #: What is the decimal point of numbers: "." or ","; both where the first rows have none.
+    decimal_marks: str = "."
     notes: tuple[str, ...] = ()
     above: tuple[str, ...] = ()  # lines above the header
     #: Column whose dates have their times of day in the next one; both are one column here.
@@ -69,6 +73,12 @@ class Layout:
         """Split a data row into cells, without a comment after it."""
         width = self.width + (self.paired is not None)
         return _join_pair(_split_data(line, self.separator, width), self.paired)
+
+    def write_point(self, cell: str) -> str:
+        """Return a cell with its decimal mark as a point, and other points as commas."""
+        if self.decimal_marks == ".":
+            return cell
+        return cell.translate(_SWAPPED) if self.decimal_marks == "," else cell.replace(",", ".")
 
     @cached_property
     def _header_names(self) -> set[str]:
@@ -188,13 +198,12 @@ def find_layout(
             f"skipped {len(skipped)} line{'s' * (len(skipped) > 1)} above the header (from line "
             f"{skipped[0]})"
         )
-    has_point = any("." in cell and is_number(cell) for row in rows for cell in row)
-    comma = separator in COMMA_SEPARATORS and not has_point
+    marks = _find_decimal_marks(rows) if separator in COMMA_SEPARATORS else "."
     samples = [row for row in rows if len(row) == len(headers)]
     notes += _describe_sources(headers, samples)
     top = tuple(lines[:above]) if header is not None else ()
     return Layout(
-        tuple(headers), separator, offset, first + 1, tuple(samples[:50]), comma, tuple(notes), top,
+        tuple(headers), separator, offset, first + 1, tuple(samples[:50]), marks, tuple(notes), top,
         paired, units, tuple(header_rows),
     )  # fmt: skip
 
@@ -227,6 +236,29 @@ def _decode_lines(path: Path, head: bytes, *, complete: bool) -> tuple[list[str]
         )
         text = [line.decode("latin-1") for line in lines]
     return text, notes
+
+
+def _find_decimal_marks(rows: Sequence[Sequence[str]]) -> str:
+    """Find the decimal point, the mark of more numbers; both where no number has one.
+
+    Numbers in which the mark may be that of thousands decide only if there are no others.
+
+    Examples
+    --------
+    >>> _find_decimal_marks([["1", "2"]]), _find_decimal_marks([["0,5", "1.2"], ["0,6", "7,8"]])
+    ('.,', ',')
+    >>> _find_decimal_marks([["900,5"], ["1.101"], ["1.102"]]), _find_decimal_marks([["1.101"]])
+    (',', '.')
+    """
+    cells = [cell for row in rows for cell in row if is_number(cell, comma=True)]
+    commas, points = ([cell for cell in cells if mark in cell] for mark in ",.")
+    if not commas and not points:
+        return ".,"
+    by_comma, by_point = (
+        (sum(not _THREE_DIGITS.search(number) for number in numbers), len(numbers))
+        for numbers in (commas, points)
+    )
+    return "," if by_comma > by_point else "."
 
 
 def _find_pair(rows: Sequence[Sequence[str]]) -> int | None:

@@ -89,6 +89,22 @@ def test_first_row_of_numbers_after_a_byte_order_mark_is_read(tmp_path: Path) ->
     assert ns(raw) == [0, 10**9]
 
 
+def test_point_among_decimal_commas_is_not_a_number(tmp_path: Path) -> None:
+    lines = [f"{n},0;900,5" for n in range(250)] + ["250,0;1.250", "251;1.251"]
+    raw = read_log(write(tmp_path, "\n".join(["time [s];gyro_x [deg/h]", *lines, ""])))
+    np.testing.assert_array_equal(raw.rate[0].values[-3:], [900.5, np.nan, np.nan])
+
+
+@pytest.mark.parametrize(("version", "second"), [("1.2", "0,25"), ("", "1.101")])
+def test_decimal_mark_is_that_of_most_numbers(tmp_path: Path, version: str, second: str) -> None:
+    """A point may also be in a version, or separate thousands."""
+    lines = [f"{n},5\t{version}\t{second if n % 2 else '900,5'}" for n in range(9)]
+    raw = read_log(write(tmp_path, "\n".join(["time [s]\tver\tgyro_x [deg/h]", *lines, ""])))
+    assert ns(raw)[:1] == [500_000_000]
+    expected = [900.5, 0.25 if version else np.nan]
+    np.testing.assert_array_equal(raw.rate[0].values[:2], expected)
+
+
 @pytest.mark.parametrize("separator", [";", "\t"])
 def test_decimal_commas_after_whole_numbers_are_read(tmp_path: Path, separator: str) -> None:
     rows = [f"{row};{row % 7}" for row in range(300)] + ["300;1,5", "300,5;-2", "301,0;3.5"]
