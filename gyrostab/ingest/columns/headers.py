@@ -248,5 +248,9 @@ def channel_name(column: Header) -> str:
 
 
 def stored_name(name: str) -> str:
-    """Return the name that a channel has in the log, where that of a variable is taken."""
-    return f"{name}_channel" if name in RESERVED_NAMES else name
+    """Return the name that a channel has in the log, where that of a variable is taken.
+
+    ``time_temperature`` holds the stamps of ``temperature``.
+    """
+    is_taken = name in RESERVED_NAMES or name.startswith("time_")
+    return f"{name}_channel" if is_taken else name

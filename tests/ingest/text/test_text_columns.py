@@ -12,6 +12,7 @@ import pytest
 from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError, UnitError
 from gyrostab.ingest import read_log
 from gyrostab.ingest.columns.headers import FileColumn, distinct_columns
+from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.units import INNER
 from tests.support.text_logs import PLAIN, ns, write
 
@@ -226,6 +227,14 @@ def test_channels_of_one_name_in_the_log_are_kept(
     raw = read_log(write(tmp_path, f"gyro_x [deg/h],{header}\n1,2,3\n1,2,3\n"), rate=1)
     assert [(name, raw[name].values[0]) for name in names] == [(names[0], 2), (names[1], 3)]
     assert any("are renamed" in note and names[1] in note for note in raw.attrs["notes"])
+
+
+def test_channel_named_like_the_stamps_of_another_gets_another_name(tmp_path: Path) -> None:
+    header = "time [s],gyro_x [deg/h],time_temperature [s],temperature [degC]"
+    rows = [f"{n},{n},{n},{20 if n % 4 == 0 else ''}" for n in range(12)]
+    log = regularise(read_log(write(tmp_path, "\n".join([header, *rows, ""]))))
+    assert log.temperature.dims == ("time_temperature",)
+    assert log.time_temperature_channel.values.tolist() == list(range(12))
 
 
 def test_only_the_ramp_has_any_scale(tmp_path: Path) -> None:
