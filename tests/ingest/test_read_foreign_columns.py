@@ -34,6 +34,7 @@ def has_note(raw: xr.Dataset, *words: str) -> bool:
     ("values", "words"),
     [
         ([-999.25] * 40, "in 40 of the first 40 rows; it is a common code for a missing value"),
+        ([21.5, -999.25, -999.25] * 10, "in 20 of the first 30 rows, far outside all other values"),
         ([*range(36), *[-9999] * 4], "far outside all other values; it is a common code"),
         ([*range(36), *[-777] * 4], "far outside all other values; if that is a code"),
         ([5.0] * 40, None),

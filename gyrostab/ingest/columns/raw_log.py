@@ -415,20 +415,22 @@ def _is_common(value: float, common: Sequence[float]) -> bool:
 def _find_code(values: NDArray[np.float64], common: Sequence[float]) -> float | None:
     """Return the lowest or highest value if it repeats far outside all others; zero is a reading.
 
-    A value that is one of the `common` codes may be the only one, or the others may be few.
+    A value that is one of the `common` codes may be the only one, or the others may be few: a slow
+    sensor has them in most rows.
 
     Examples
     --------
     >>> _find_code(np.r_[np.arange(100.0), [-999.25] * 3], []), _find_code(np.arange(100.0), [])
     (-999.25, None)
-    >>> _find_code(np.r_[[20.0, 21.0] * 9, [-999.25] * 3], [-999.25])
+    >>> _find_code(np.r_[[20.0, 21.0] * 9, [-999.25] * 99], [-999.25])
     -999.25
     """
     for code in (values.min(initial=np.inf), values.max(initial=-np.inf)):
         others, is_common = values[values != code], _is_common(code, common)
         if is_common and values.size and not others.size:
             return float(code)
-        if code == 0 or not _MIN_CODE_REPEATS <= len(values) - len(others) < len(others):
+        repeats = len(values) - len(others)
+        if code == 0 or repeats < _MIN_CODE_REPEATS or not (is_common or repeats < len(others)):
             continue
         if _is_far(code, others) and (is_common or len(np.unique(others)) >= _MIN_READINGS):
             return float(code)
