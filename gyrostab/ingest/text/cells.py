@@ -101,7 +101,7 @@ class BlockParser:
             end = block.index(b"\n", at) + 1
             if _MINUS_SIGN in block[at:end]:
                 return self.parse(block.replace(_MINUS_SIGN, b"-"))
-            line = block[at:end].decode("latin-1").strip("\r\n")
+            line = decode_line(block[at:end]).strip("\r\n")
             if line.split("#")[0].strip():
                 other_lines[row], starts[row] = line, at
                 row += 1

@@ -48,6 +48,7 @@ from tests.support.text_logs import PLAIN, ns, write
         "day,clock,gyro_x\nYYYY-MM-DD,,deg/h\n1970-01-01,00:00:00,1.5\n1970-01-01,00:00:01,2.5\n",
         "time,gyro_x\nDD/MM/YYYY,deg/h\n01/01/1970 00:00,1.5\n01/01/1970 00:00:01,2.5\n",
         "time [s]\tgyro_x [deg/h]\n0,0\t1,5\n1,0\t2,5\n",
+        "time [s];gyro_x [deg/h]\n0,0;1,5\u00a0\n1,0;2,5\u00a0\n",
         "t;gyro_x [deg/h]\n01.01.1970, 00:00:00;1,5\n01.01.1970, 00:00:01;2,5\n",
         "time [s] gyro_x [deg/h]\n 0.000D+00 0.150D+01\n 0.100D+01 0.250D+01\n",
         "time,battery,gyro_x [deg/h]\n1970-01-01T00:00:00,87%,1.5\n1970-01-01T00:00:01,87%,2.5\n",
