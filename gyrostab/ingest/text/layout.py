@@ -215,6 +215,10 @@ def _decode_lines(path: Path, head: bytes, *, complete: bool) -> tuple[list[str]
         raise FormatError(
             f"{path.name}: the file is UTF-16 text; save it as UTF-8 (iconv -f utf-16 -t utf-8)"
         )
+    if b"\n" not in head and b"\r" in head.rstrip():
+        raise FormatError(
+            f"{path.name}: its lines end with CR alone, as on old Macs; convert it: tr '\\r' '\\n'"
+        )
     if not is_text(
         head[:4096]
     ):  # further down, binary data such as zeros after a power loss affects single rows only

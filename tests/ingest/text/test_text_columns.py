@@ -370,6 +370,7 @@ def test_keys_of_columns_are_unique() -> None:
             r"no gyro column.*give it as --channel log\.csv",
         ),
         (b"", {}, FormatError, r"log.csv: the file is empty"),
+        (b"time [s],gyro_x [deg/h]\r0,1\r", {}, FormatError, r"end with CR alone.* tr '\\r' '\\n'"),
         (b"\n\n  \n", {}, FormatError, r"empty"),
         ("# only\n# comments\n", {}, FormatError, r"only 2 blank or comment lines"),
         (PLAIN, {}, FormatError, r"header \(line 1\) but no data row"),
