@@ -133,6 +133,14 @@ def test_las_without_rows_is_refused(tmp_path: Path) -> None:
         read_log(write_las(tmp_path / "a.las", "YYYYMMDD", "HHMMSS", []))
 
 
+def test_las_3_with_commas_is_refused(tmp_path: Path) -> None:
+    path = write_las(tmp_path / "a.las", "YYYYMMDD", "HHMMSS", [])
+    head, _, rows = path.read_text().partition("WRAP. NO :\n")
+    path.write_text(f"{head}WRAP. NO :\nDLM . COMMA : of LAS 3\n{rows}20260314,120000,1.5,60\n")
+    with pytest.raises(FormatError, match=r"a\.las: commas separate.*export the log as LAS 2"):
+        read_log(path)
+
+
 def test_dates_with_the_year_first_or_last_are_refused(tmp_path: Path) -> None:
     path = write_las(tmp_path / "a.las", "", "S", ["26/03/14 1", "26/03/14 2"])
     with pytest.raises(FormatError, match=r"is not clear.*--map DATE=-"):

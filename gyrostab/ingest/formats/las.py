@@ -26,6 +26,8 @@ from gyrostab.time.stamps import to_nanoseconds
 
 # Date fields in units of curves -> codes of `datetime.strptime`.
 _DATE_CODES = {"yyyy": "%Y", "yy": "%y", "mmm": "%b", "mm": "%m", "dd": "%d"}
+#: The line of a header that lets commas separate values; lasio takes them for decimal points.
+_COMMAS = re.compile(rb"(?im)^\s*DLM\s*\.\s*COMMA")
 #: A cell with a date and a time of day, such as ``14-Mar-26/08:00:00.5``.
 _DATE_AND_TIME = re.compile(r"^(\S+?)[T_/:;-](\d{1,2}:\d\d:\d\d(?:\.\d+)?)Z?$")
 
@@ -37,6 +39,11 @@ def matches(path: Path) -> bool:
 
 
 def _read_curves(path: Path, options: ReadOptions) -> TablesOfFile:
+    if _COMMAS.search(read_head(path)):
+        raise FormatError(
+            f"{path.name}: commas separate its values (DLM. COMMA, of LAS 3), which is not read; "
+            "export the log as LAS 2 or CSV"
+        )
     lasio = library("lasio", path, extra="las")
     curves = list(lasio.read(str(path)).curves)
     rows = len(curves[0].data) if curves else 0
