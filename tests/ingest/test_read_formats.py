@@ -17,7 +17,7 @@ from pyarrow import parquet
 from scipy.io import savemat
 
 import gyrostab
-from gyrostab.errors import FormatError, MissingUnitError, OptionError
+from gyrostab.errors import FormatError, MissingUnitError, OptionError, UnitError
 from gyrostab.ingest import ReadOptions, read_log, readers, scan_file
 from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.columns.pieces import Buffers, Spool
@@ -224,6 +224,14 @@ def test_float32_rates_convert_in_float64(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         raw.rate[0], np.rad2deg(values.astype(np.float64)) * 3600, rtol=1e-14
     )
+
+
+def test_times_of_day_in_parquet_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "clock.parquet"
+    times = pa.array([10**6, 2 * 10**6], pa.time64("us"))
+    parquet.write_table(pa.table({"time": times, "gyro_x [rad/s]": [1.0, 2.0]}), path)
+    with pytest.raises(UnitError, match=r"'time' holds times of day without a date"):
+        read_log(path)
 
 
 def test_parquet_dates_and_field_units(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.dates import YEAR_FIRST, find_order, holds_date
+from gyrostab.ingest.columns.dates import NO_DATE, YEAR_FIRST, find_order, holds_date
 from gyrostab.ingest.columns.headers import FileColumn, split_header
 from gyrostab.ingest.columns.plan import Plan
 from gyrostab.ingest.columns.plan_roles import plan_columns
@@ -99,6 +99,8 @@ def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
         texts = [value for value in sample if isinstance(value, str)]
         is_dated = any(map(holds_date, texts))
         order = find_order(texts) if is_dated else YEAR_FIRST
+        if pa.types.is_time(entry.type):
+            is_dated, order = True, NO_DATE
         stamped = is_dated or holds_dates(sample)
         columns.append(FileColumn(header, unit, stamped=stamped, date_order=order))
     return file, plan_columns(path, columns, options)
