@@ -240,6 +240,22 @@ def test_tdms(tmp_path: Path, waveform: bool) -> None:
     assert (summary.first, summary.last) == (STAMPS[0], STAMPS[-1])
 
 
+@pytest.mark.parametrize(("seconds", "is_noted"), [(10, True), (0, False)])
+def test_segments_of_tdms_with_other_starts_are_noted(
+    tmp_path: Path, seconds: int, is_noted: bool
+) -> None:
+    from nptdms import ChannelObject, TdmsWriter
+
+    with TdmsWriter(str(tmp_path / "run.tdms")) as writer:
+        for segment in range(2):
+            start = STAMPS[0].astype("datetime64[us]") + np.timedelta64(segment * seconds, "s")
+            clock = {"unit_string": "deg/h", "wf_increment": 0.5, "wf_start_time": start}
+            axes = [ChannelObject("imu", f"gyro_{axis}", np.arange(9.0), clock) for axis in "xy"]
+            writer.write_segment(axes)
+    notes = read_log(tmp_path / "run.tdms").attrs["notes"]
+    assert any("write a file for each start" in note for note in notes) == is_noted
+
+
 LAYOUT = """
 header_bytes = 16
 byte_order = "{order}"

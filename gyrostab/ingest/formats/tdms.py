@@ -6,6 +6,9 @@ group.
 
 from __future__ import annotations
 
+import re
+import struct
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,7 +27,14 @@ from gyrostab.time.stamps import to_nanoseconds
 _FIRST_DATE = np.datetime64(
     "1950-01-01", "us"
 )  # LabVIEW counts from 1904, and writes 1904 if it has no clock
-
+#: Bytes before the metadata of a segment, flag of its byte order, and largest segment: one that was
+#: not finished has the largest 64-bit number.
+_LEAD_BYTES, _BIG_ENDIAN, _MAX_SEGMENT_BYTES = 28, 0x40, 2**48
+#: Paths of channels, and start times (of type 0x44) after them, in the metadata of a segment.
+_STARTS = re.compile(
+    rb"(?s)(?P<channel>/'[^\0-\x1f]*'/'[^\0-\x1f]*')"
+    rb"|wf_start_time(?:D\0\0\0|\0\0\0D)(?P<start>.{16})"
+)
 
 matches = make_matcher(b"TDSm", ".tdms")
 
@@ -40,10 +50,30 @@ def _open_tables(path: Path, options: ReadOptions) -> Iterator[TablesOfFile]:
                 if len(channel):
                     clock = _waveform_clock(path, channel) or channel.group_name
                     groups.setdefault((len(channel), clock), []).append(channel)
-        yield [_make_table(path, channels) for channels in groups.values()], ()
+        yield [_make_table(path, channels) for channels in groups.values()], _describe_starts(path)
 
 
 scan, read = make_reader("tdms", _open_tables)
+
+
+def _describe_starts(path: Path) -> list[str]:
+    """Return a note if a channel begins again in a later segment, as the library merges them."""
+    starts = defaultdict[bytes, set[bytes]](set)
+    with path.open("rb") as file:
+        while len(lead := file.read(_LEAD_BYTES)) == _LEAD_BYTES:
+            size, metadata = struct.unpack(">QQ" if lead[4] & _BIG_ENDIAN else "<QQ", lead[12:])
+            begin, channel = file.tell(), b""
+            for part in _STARTS.finditer(file.read(min(metadata, size, _MAX_SEGMENT_BYTES))):
+                channel = part["channel"] or channel
+                starts[channel].update([part["start"]] if part["start"] else [])
+            file.seek(begin + min(size, _MAX_SEGMENT_BYTES))
+    if all(len(times) < 2 for times in starts.values()):
+        return []
+    return [
+        "segments of one channel begin at different times (wf_start_time); the last is used for "
+        "all rows, so earlier rows have late stamps and pauses are lost; write a file for each"
+        " start"
+    ]
 
 
 def _waveform_clock(path: Path, channel: Any) -> tuple[float, Any] | None:
