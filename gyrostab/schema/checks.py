@@ -307,7 +307,9 @@ def _check_labels(dataset: xr.Dataset, kind: str) -> None:
     """Windows have dates and times, axes have names, and there are some of them."""
     for name, counted in (("time", "window"), ("axis", "axis"), ("tau", "averaging time")):
         if dataset.sizes.get(name) == 0:
-            raise SchemaError(f"there is no {counted}: the dimension {name!r} is empty; select some")
+            raise SchemaError(
+                f"there is no {counted}: the dimension {name!r} is empty; select some"
+            )
     for name, kinds, holds, example in (
         ("time", "M", "dates and times", "times of datetime64"),
         ("axis", "OTU", "names", "['x', 'y', 'z']"),
