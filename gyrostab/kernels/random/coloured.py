@@ -165,7 +165,7 @@ def mount(resonance: float, quality: float, rate: float, *, average: bool = True
     """
     omega = 2.0 * math.pi * resonance
     a, b, c = _chain_sections([_Section(omega, omega / quality, False)])
-    covariance = solve_continuous_lyapunov(a, -np.outer(b, b))
+    covariance: Array = np.asarray(solve_continuous_lyapunov(a, -np.outer(b, b)), np.float64)
     return _make_reading(a, b, covariance, c, rate, average=average)
 
 
