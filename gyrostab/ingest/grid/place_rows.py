@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -94,6 +94,8 @@ class RowPlacer:
         # single unreadable rows still occupy samples
         count_all_rows = scanned.absent <= 0.01 * scanned.rows
         stamps: Stamps = partial(stamp_blocks, raw, scanned)
+        doubled = find_doubled(raw)
+        scanned.leave_out(doubled[:, 0])
         try:
             estimate = estimate_rate(stamps, where=self.where)
         except TimeError:
@@ -115,6 +117,9 @@ class RowPlacer:
             placement = self._place_stamped(stamps, estimate.jitter, rate, count_all_rows)
             if _is_sharp(estimate.jitter):
                 deviating = deviating_stretches(stamps, 1e9 / rate)
+        doubled = doubled[~np.isin(doubled[:, 0], placement.events[:, 2])]  # without longer ones
+        if len(doubled):
+            placement = _with_duplicates(placement, [_duplicates(placement, *doubled.T)])
         notes += describe_rate(raw, estimate, deviating, placement)
         changes = tuple(
             end[1]
@@ -180,9 +185,11 @@ class RowPlacer:
 
         if jitter is not None and not _is_sharp(jitter):
             return place_along(jitter)
+        doubled = scanned.repeated
         placement = self._place_once(partial(place_by_stamp, stamps, rate, **options))
         dropped = scanned.rows - scanned.absent - scanned.repeated - placement.placed
-        if not scanned.repeated and (dropped >= _MIN_DROPPED_ROWS or placement.has_late_rows):
+        has_repeats = scanned.repeated > doubled
+        if not has_repeats and (dropped >= _MIN_DROPPED_ROWS or placement.has_late_rows):
             # placing in order may recover them
             along = place_along(jitter or JitterModel(1e9 / rate, MIN_SIGMA, "all", 1.0, 0.5))
             if along.placed - placement.placed >= _LATE_SHARE * dropped:
@@ -197,7 +204,7 @@ class RowPlacer:
             if not len(repeats):
                 break
             for row, _source, length in repeats.tolist():
-                self.scanned.leave_out(row, row + length)
+                self.scanned.leave_out(np.arange(row, row + length))
             all_repeats = np.concatenate([all_repeats, repeats])
             placement = place()
         return with_repeats(placement, self.raw, all_repeats) if len(all_repeats) else placement
@@ -269,15 +276,60 @@ def _count_repeated(raw: xr.Dataset, source: int, row: int) -> int:
     return length if changes and Match(compared, same).alike else 0
 
 
+def find_doubled(raw: xr.Dataset) -> Integers:
+    """Find the rows that were written twice: they repeat stamp and values of the row before.
+
+    Rows that share a stamp because the clock is coarse have other values. Values that are
+    equal in most other rows too are not taken as a repetition.
+
+    Returns (n, 3): row, the row that it repeats, and its stamp [ns].
+    """
+    signal = raw[signal_name(raw)].data
+    tables: list[Integers] = []
+    shared = same = apart = constant = 0
+    for begin, end in _growing_blocks(raw.sizes["row"] - 1):
+        stamps = read_stamps(raw, begin, end + 1)
+        is_shared = (stamps[1:] == stamps[:-1]) & (stamps[1:] != NO_STAMP)
+        if not is_shared.any():
+            continue
+        cells = read_slice(signal, begin, end + 1)
+        before, after = cells[:, :-1], cells[:, 1:]
+        is_equal = (before == after) | (np.isnan(before) & np.isnan(after))
+        is_same = is_equal.all(axis=0) & ~np.isnan(after).all(axis=0)
+        rows = np.flatnonzero(is_shared & is_same) + 1
+        tables.append(np.stack([rows + begin, stamps[rows]]))
+        shared, same = shared + int(is_shared.sum()), same + len(rows)
+        apart = apart + int((~is_shared).sum())
+        constant = constant + int((~is_shared & is_same).sum())
+        if shared >= _MIN_ROWS and same < _MIN_SAME_SHARE * shared:
+            break
+    is_certain = shared >= _MIN_ROWS and Match(shared, same).alike
+    if not is_certain or constant >= _MIN_SAME_SHARE * apart:
+        return np.empty((0, 3), dtype=np.int64)
+    rows, stamps = np.concatenate(tables, axis=1)
+    is_first = np.diff(rows, prepend=-1) > 1
+    source = np.maximum.accumulate(np.where(is_first, rows - 1, 0))
+    return np.stack([rows, source, stamps], axis=1)
+
+
 def with_repeats(placement: Placement, raw: xr.Dataset, repeats: Integers) -> Placement:
     """Add repeated rows as duplicates to the events of a placement made without them."""
-    events = [placement.events]
+    tables = []
     for row, source, length in repeats.tolist():
-        rows = np.arange(length)
-        sample = np.maximum.accumulate(np.maximum(placement.samples_of(rows + source), 0))
-        stamps = read_stamps(raw, row, row + length)
-        is_readable = stamps != NO_STAMP
-        table = np.stack([np.full(length, DUPLICATE), sample, rows + row, stamps, stamps], axis=1)
-        events.append(table[is_readable])
-    table = np.concatenate(events)
+        rows, stamps = np.arange(length), read_stamps(raw, row, row + length)
+        table = _duplicates(placement, rows + row, rows + source, stamps)
+        tables.append(table[stamps != NO_STAMP])
+    return _with_duplicates(placement, tables)
+
+
+def _duplicates(
+    placement: Placement, rows: Integers, source: Integers, stamps: Integers
+) -> Integers:
+    """Return events of rows that repeat those of `source`."""
+    sample = np.maximum.accumulate(np.maximum(placement.samples_of(source), 0))
+    return np.stack([np.full(len(rows), DUPLICATE), sample, rows, stamps, stamps], axis=1)
+
+
+def _with_duplicates(placement: Placement, tables: Sequence[Integers]) -> Placement:
+    table = np.concatenate([placement.events, *tables])
     return replace(placement, events=table[np.argsort(table[:, 1], kind="stable")])

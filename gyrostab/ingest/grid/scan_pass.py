@@ -40,12 +40,11 @@ class ScanPass:
     filled: dict[str, int] = field(default_factory=dict)
     repeated: int = 0  # number of rows that repeat others
 
-    def leave_out(self, begin: int, end: int) -> None:
-        """Mark the rows `begin` to `end` as repetitions, which hold no new sample."""
-        bits = np.unpackbits(self.present[begin // 8 : -(-end // 8)])
-        self.repeated += int(bits[begin % 8 : begin % 8 + end - begin].sum())
-        bits[begin % 8 : begin % 8 + end - begin] = 0
-        self.present[begin // 8 : -(-end // 8)] = np.packbits(bits)
+    def leave_out(self, rows: Integers) -> None:
+        """Mark rows as repetitions, which hold no new sample."""
+        bits = (128 >> rows % 8).astype(np.uint8)
+        self.repeated += int(np.count_nonzero(self.present[rows // 8] & bits))
+        np.bitwise_and.at(self.present, rows // 8, ~bits)
 
     def mask(self, begin: int, end: int) -> NDArray[np.bool_]:
         """Return which of the rows `begin` to `end` hold a sample."""

@@ -96,3 +96,42 @@ def test_few_rows_are_compared_at_each_of_many_restarts(monkeypatch):
     log = regularise(raw_log(START + np.arange(n) % 100 * 10_000_000, values))
     assert (gap_table(log).cause == "restart").sum() == n // 100 - 1
     assert sum(rows_read) < 100 * n
+
+
+WRITTEN_TWICE = {
+    "every row": np.repeat(np.arange(1000), 2),
+    "every tenth row": np.repeat(np.arange(1000), 1 + (np.arange(1000) % 10 == 0)),
+    "a stretch, sorted": np.sort(np.r_[0:1000, 400:600]),
+    "three times": np.repeat(np.arange(1000), 3),
+    "and a stretch again": np.repeat(np.r_[0:600, 400:1000], 2),
+}
+
+
+@pytest.mark.parametrize("rows", WRITTEN_TWICE.values(), ids=WRITTEN_TWICE)
+@pytest.mark.parametrize("block", [64, 1 << 20])
+def test_rows_written_twice_are_duplicates(rows, block):
+    samples = np.r_[0:700, 750:1050]
+    values = np.round(np.random.default_rng(1).standard_normal((2, 1000)), 3)
+    values[1, 300:310] = np.nan
+    once = regularise(raw_log(stamps_of(samples, 10.0), values))
+    raw = raw_log(stamps_of(samples[rows], 10.0), values[:, rows])
+    for rate in (None, 10.0):
+        log = regularise_in_parts(raw, block=block, rate=rate)
+        assert log.attrs["sampling_rate_hz"] == 10.0
+        assert np.array_equal(log.rate.values, once.rate.values, equal_nan=True)
+        assert np.array_equal(log.time.values, once.time.values)
+        table = gap_table(log)
+        twice = table[table.cause == "duplicate"]
+        assert twice.rows.sum() == len(rows) - 1000
+        first = samples[rows[np.flatnonzero(np.diff(rows) == 0)[0]]]
+        assert twice.start.min() == log.time.values[first]
+        assert not any("Hz" in note for note in log.attrs["notes"])
+
+
+@pytest.mark.parametrize("digits", [3, 0, -9], ids=["values change", "coarse", "constant"])
+def test_rows_of_a_coarse_clock_are_not_duplicates(digits):
+    values = np.round(np.random.default_rng(1).standard_normal(3000), digits)
+    stamps = START + np.arange(3000) // 10 * 1_000_000_000
+    log = regularise(raw_log(stamps, values))
+    assert log.attrs["sampling_rate_hz"] == 10.0
+    assert np.array_equal(log.rate.values[0], values)
