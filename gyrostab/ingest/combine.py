@@ -30,6 +30,8 @@ from gyrostab.store.write import common_packing
 from gyrostab.units import find_conversion
 from gyrostab.wording import list_some
 
+#: Largest distance of first stamps from the zero of their clock [lengths of the shortest file].
+_MAX_BEGIN = 0.1
 _BLOCK_ROWS, _FIRST_ROWS = 2**20, 2**12
 #: Advice where units of a channel do not convert to each other.
 _ADVICE = (
@@ -119,29 +121,29 @@ def _move_stamps(part: xr.Dataset, added: int) -> xr.Dataset:
 def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     """Concatenate raw logs along ``row`` in the order of their first stamps, without repeated rows.
 
+    Logs without stamps, and those whose clocks begin again at zero, are in the order given.
     `TimeError` when only some files have stamps; `UnitError` when they hold different kinds of
     signal, or a channel changes its unit.
     """
     if len(parts) == 1:
         joined = parts[0]
     else:
-        split_parts = _in_order([group for part in parts for group in split_axes(part)])
+        split_parts = [group for part in parts for group in split_axes(part)]
+        is_timed = _have_stamps(split_parts)
         signal = _common_signal(split_parts)
-        slow_channels = [
-            [str(name) for name, v in part.data_vars.items() if v.dims == (f"time_{name}",)]
-            for part in split_parts
-        ]  # those with a separate time coordinate
         ordered = [
             part.drop_vars([*names, *(f"time_{name}" for name in names)])
-            for part, names in zip(split_parts, slow_channels, strict=True)
+            for part, names in zip(split_parts, map(_slow_channels, split_parts), strict=True)
         ]
         groups = _group_by_axes(ordered)
-        if "time" in ordered[0].variables and signal is not None:
-            groups = [drop_repeats(group, signal) for group in groups]
+        if is_timed:
+            groups = [_in_order(group, signal) for group in groups]
         joined = _concatenate_parts([part for group in groups for part in group], signal, groups)
-        apart = [
-            part[names] for part, names in zip(split_parts, slow_channels, strict=True) if names
-        ]
+        by_time = sorted(split_parts, key=first_known_stamp) if is_timed else split_parts
+        apart = [part[names] for part in by_time if (names := _slow_channels(part))]
+        if not is_timed and len(groups) == 1:
+            order = list_some(joined.attrs["source_files"], 6)
+            joined.attrs["notes"].append(f"without stamps, files follow in this order: {order}")
         joined = attach_channels(joined, apart)
     if joined.sizes["row"] < 2:
         name = joined.attrs["source_files"][0]
@@ -169,18 +171,43 @@ def _axis_names(part: xr.Dataset) -> list[str]:
     return [str(axis) for axis in part["axis"].values] if "axis" in part.coords else []
 
 
-def _in_order(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
+def _slow_channels(part: xr.Dataset) -> list[str]:
+    """Name the channels with a separate time coordinate."""
+    return [str(name) for name, v in part.data_vars.items() if v.dims == (f"time_{name}",)]
+
+
+def _have_stamps(parts: Sequence[xr.Dataset]) -> bool:
+    """Return whether the files have stamps; `TimeError` if only some have."""
     timed = ["time" in part.variables for part in parts]
-    if not any(timed):
-        return list(parts)
-    if not all(timed):
+    if any(timed) and not all(timed):
         names = [part.attrs["source_files"][0] for part in parts]
         with_time, without = names[timed.index(True)], names[timed.index(False)]
         raise TimeError(
             f"{with_time} has time stamps and {without} has none; read them one by one, or give "
             "the latter a time column"
         )
-    return sorted(parts, key=first_known_stamp)
+    return all(timed)
+
+
+def _in_order(parts: Sequence[xr.Dataset], signal: str | None) -> list[xr.Dataset]:
+    """Return the files in the order of their first stamps, without repeated rows.
+
+    They stay in the order given if their clocks begin at zero and none repeats rows of another.
+    """
+    by_time = sorted(parts, key=first_known_stamp)
+    if signal is not None:
+        by_time = drop_repeats(by_time, signal)
+    is_unchanged = {*map(id, by_time)} == {*map(id, parts)}
+    return list(parts) if is_unchanged and _begin_at_zero(parts) else by_time
+
+
+def _begin_at_zero(parts: Sequence[xr.Dataset]) -> bool:
+    """Return whether the clock of each file begins near its zero, by the length of the shortest."""
+    if not all("clock_zero" in part.attrs for part in parts):
+        return False
+    firsts, lasts = np.array(list(map(stamp_span, parts))).T
+    begins = firsts - [part.attrs["clock_zero"] for part in parts]
+    return bool(np.abs(begins).max() <= _MAX_BEGIN * (lasts - firsts).min())
 
 
 def _common_signal(parts: Sequence[xr.Dataset]) -> str | None:

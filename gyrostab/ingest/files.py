@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -84,7 +85,11 @@ def find_reader(path: Path) -> Reader:
 
 
 def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
-    """Return the files that paths and patterns name, each once."""
+    """Return the files that paths and patterns name, each once.
+
+    They are in the order given, and those of a pattern in alphabetical order; but files whose names
+    differ only in numbers are in the order of these: run_9 comes before run_10.
+    """
     files: dict[Path, None] = {}
     for item in [paths] if isinstance(paths, str | Path) else paths:
         text = str(item)
@@ -100,7 +105,24 @@ def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
         files.update(dict.fromkeys(matching))
     if not files:
         raise OptionError("no file was given; name at least one log")
-    return list(files)
+    return _order_by_numbers(list(files))
+
+
+def _order_by_numbers(paths: Sequence[Path]) -> list[Path]:
+    """Exchange paths that differ only in numbers so that these rise."""
+    same_words: dict[str, list[Path]] = {}
+    for path in sorted(paths, key=name_key, reverse=True):
+        same_words.setdefault(re.sub(r"\d+", "0", str(path)), []).append(path)
+    return [same_words[re.sub(r"\d+", "0", str(path))].pop() for path in paths]
+
+
+def name_key(path: Path) -> list[tuple[int, int, str]]:
+    """Return a sort key by which run_9 comes before run_10."""
+    return [
+        (0, int(piece), "") if piece.isdigit() else (1, 0, piece)
+        for piece in re.split(r"(\d+)", str(path))
+        if piece
+    ]
 
 
 def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSummary:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +24,7 @@ from gyrostab.ingest.combine import (
 )
 from gyrostab.ingest.concat.core import concatenate_logs
 from gyrostab.ingest.concat.grid import log_span
-from gyrostab.ingest.files import expand, read_file, scan_file
+from gyrostab.ingest.files import expand, name_key, read_file, scan_file
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.ingest.uniform import check_same_rate
 from gyrostab.schema import texts
@@ -149,7 +148,7 @@ def read_log(
             "logs with gyrostab ingest, and then read all of them together"
         )
     if not regular:
-        names = sorted(parts, key=_name_key)
+        names = sorted(parts, key=name_key)
         parts.update(zip(names, continue_clocks([parts[path] for path in names]), strict=True))
     channels = [read_file(path, replace(options, channels_only=True, start=None)) for path in extra]
     spans = _find_lost_spans(lost, parts, options) if lost else {}
@@ -315,15 +314,6 @@ def _reason_of(path: Path, error: Exception) -> str:
     return text if path.name in text.split(": ")[0] else f"{path.name}: {text}"
 
 
-def _name_key(path: Path) -> list[tuple[int, int, str]]:
-    """Return a sort key by which run_9 comes before run_10."""
-    return [
-        (0, int(piece), "") if piece.isdigit() else (1, 0, piece)
-        for piece in re.split(r"(\d+)", str(path))
-        if piece
-    ]
-
-
 def _find_lost_spans(
     lost: LostFiles, parts: Mapping[Path, xr.Dataset], options: ReadOptions
 ) -> dict[Path, Span]:
@@ -338,7 +328,7 @@ def _find_lost_spans(
         for path, part in parts.items()
         if "time" in part.variables
     }
-    names = sorted([*spans, *lost], key=_name_key)
+    names = sorted([*spans, *lost], key=name_key)
     lost_spans: dict[Path, Span] = {}
     for path in lost:
         place = names.index(path)

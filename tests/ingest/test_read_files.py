@@ -203,6 +203,39 @@ def test_files_without_stamps_keep_their_order_and_do_not_mix(tmp_path: Path) ->
         read_log([first, timed], rate=10)
 
 
+@pytest.mark.parametrize("first_stamps", [None, [0.3, 0.1, 0.2]], ids=["no time", "from zero"])
+def test_files_without_a_common_clock_are_in_the_order_of_their_numbers(
+    tmp_path: Path, first_stamps: list[float] | None
+) -> None:
+    for number in range(1, 13):
+        text = "gyro_x [deg/h]\n" + f"{number}\n" * 3
+        if first_stamps is not None:
+            start = first_stamps[number % 3]
+            rows = [f"{start + k},{100 * number + k}\n" for k in range(10)]
+            text = "time [s],gyro_x [deg/h]\n" + "".join(rows)
+        write(tmp_path / f"run_{number}.csv", text)
+    shell = sorted(tmp_path.glob("run_*.csv"))
+    assert shell[1].name == "run_10.csv"
+    for paths in (str(tmp_path / "run_*.csv"), shell):
+        raw = read_log(paths, rate=1.0)
+        assert raw.attrs["source_files"] == [f"run_{number}.csv" for number in range(1, 13)]
+        assert (np.diff(raw.rate[0]) >= 0).all()
+        is_noted = any(
+            "order: run_1.csv, run_2.csv, run_3.csv" in note for note in raw.attrs["notes"]
+        )
+        assert is_noted == (first_stamps is None)
+
+
+def test_files_of_one_clock_are_in_the_order_of_their_stamps_not_of_their_numbers(
+    tmp_path: Path,
+) -> None:
+    header = "time [s],gyro_x [deg/h]\n"
+    for number, start in ((1, 100), (2, 50), (10, 0)):
+        rows = "".join(f"{start + k},{start + k}\n" for k in range(50))
+        write(tmp_path / f"run_{number}.csv", header + rows)
+    np.testing.assert_array_equal(read_log(str(tmp_path / "*.csv")).rate[0], np.arange(150))
+
+
 def test_kinds_and_channel_units_must_agree(tmp_path: Path) -> None:
     rate = write(tmp_path / "rate.csv", "time [s],gyro_x [deg/h],flow [l/min]\n0,1,1\n1,2,1\n")
     angle = write(tmp_path / "angle.csv", "time [s],angle_x [deg]\n2,1\n3,2\n")
