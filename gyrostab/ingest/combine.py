@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -137,7 +137,7 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
         ]
         groups = _group_by_axes(ordered)
         if is_timed:
-            groups = [_in_order(group, signal) for group in groups]
+            groups = [part for group in groups for part in _in_order(group, signal)]
         joined = _concatenate_parts([part for group in groups for part in group], signal, groups)
         by_time = sorted(split_parts, key=first_known_stamp) if is_timed else split_parts
         apart = [part[names] for part in by_time if (names := _slow_channels(part))]
@@ -189,16 +189,19 @@ def _have_stamps(parts: Sequence[xr.Dataset]) -> bool:
     return all(timed)
 
 
-def _in_order(parts: Sequence[xr.Dataset], signal: str | None) -> list[xr.Dataset]:
-    """Return the files in the order of their first stamps, without repeated rows.
+def _in_order(parts: Sequence[xr.Dataset], signal: str | None) -> list[list[xr.Dataset]]:
+    """Return the files in the order of their first stamps, without repeated rows, in groups.
 
-    They stay in the order given if their clocks begin at zero and none repeats rows of another.
+    They stay in the order given if their clocks begin at zero and none repeats rows of another. The
+    files of a group after the first repeat rows of earlier groups, with other axes or channels.
     """
+    groups: list[list[xr.Dataset]] = []
     by_time = sorted(parts, key=first_known_stamp)
-    if signal is not None:
-        by_time = drop_repeats(by_time, signal)
-    is_unchanged = {*map(id, by_time)} == {*map(id, parts)}
-    return list(parts) if is_unchanged and _begin_at_zero(parts) else by_time
+    while by_time:
+        together, by_time = (by_time, []) if signal is None else drop_repeats(by_time, signal)
+        groups.append(together)
+    is_unchanged = {*map(id, groups[0])} == {*map(id, parts)}
+    return [list(parts)] if is_unchanged and _begin_at_zero(parts) else groups
 
 
 def _begin_at_zero(parts: Sequence[xr.Dataset]) -> bool:
@@ -359,33 +362,72 @@ def _read_channels(
     return channels
 
 
-def drop_repeats(parts: Sequence[xr.Dataset], signal: str) -> list[xr.Dataset]:
-    """Drop the rows of each file that repeat rows of earlier files, with notes.
+def drop_repeats(
+    parts: Sequence[xr.Dataset], signal: str
+) -> tuple[list[xr.Dataset], list[xr.Dataset]]:
+    """Drop the rows of each file that repeat rows of other files, with notes.
 
     Two files overlap if rows of both have the same stamps and the same values. Files whose clocks
     merely cover the same hours, as after a restart of the clock, have other values and stay
     unchanged. `parts` are in the order of their first stamps. A file without new rows is dropped as
     a whole. The notes are in the file that contains the rows.
+
+    Rows are dropped from a file whose axes and channels the other has too. Where neither has all,
+    the later file is returned in the second list.
     """
     kept_parts: list[tuple[xr.Dataset, int]] = []  # with the latest stamp of each
+    parts_apart: list[xr.Dataset] = []
     for part in parts:
         first, end = stamp_span(part)
+        is_apart = False
         for place, (held, held_end) in reversed(list(enumerate(kept_parts))):
             if first > held_end:
                 continue
             tail, head = _rows_from(held, first), _rows_until(part, held_end)
             if not _is_copy(held, part, signal, tail, head):
                 continue
-            if head > held.sizes["row"] - tail and end >= held_end:
-                # it contains rows that the earlier file lost
+            ours, theirs = (
+                _extent_of(held, signal, slice(tail, None)),
+                _extent_of(part, signal, slice(head)),
+            )
+            is_fuller = theirs.cells > ours.cells and theirs.rows >= ours.rows
+            if is_fuller and theirs.columns >= ours.columns and end >= held_end:
+                # it contains cells that the earlier file lost
                 held, part = _drop_rows(held, slice(0, tail), part)
                 held_end = first - 1
-            else:
+            elif theirs.columns <= ours.columns:
                 part, held = _drop_rows(part, slice(head, None), held)
                 first, end = stamp_span(part)
+            else:
+                is_apart = True
+                break
             kept_parts[place] = held, held_end
-        kept_parts = [(log, last) for log, last in [*kept_parts, (part, end)] if log.sizes["row"]]
-    return [log for log, _ in kept_parts]
+        if is_apart:
+            parts_apart.append(part)
+        else:
+            kept_parts.append((part, end))
+        kept_parts = [(log, last) for log, last in kept_parts if log.sizes["row"]]
+    return [log for log, _ in kept_parts], parts_apart
+
+
+class _Extent(NamedTuple):
+    """Rows of a file, its axes and channels, and how many cells of these are filled."""
+
+    rows: int
+    columns: set[str]
+    cells: int
+
+
+def _extent_of(part: xr.Dataset, signal: str, rows: slice) -> _Extent:
+    """Return the extent of some rows; cells of the signal are read if some are unreadable."""
+    begin, end, _ = rows.indices(part.sizes["row"])
+    columns = {*_axis_names(part), *map(str, part.data_vars)}
+    cells = (end - begin) * len(columns)
+    if part.attrs["unreadable_rows"] or part.attrs["unreadable_cells"]:
+        for start in range(begin, end, _BLOCK_ROWS):
+            block = read_slice(part[signal].data, start, min(start + _BLOCK_ROWS, end))
+            cells -= int(np.count_nonzero(np.isnan(block)))
+    return _Extent(end - begin, columns, cells)
 
 
 def _drop_rows(part: xr.Dataset, rows: slice, other: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:

@@ -14,6 +14,7 @@ import gyrostab.ingest.files as files
 import gyrostab.ingest.reading as reading
 from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, UnitError
 from gyrostab.ingest import FileSummary, ReadOptions, read_log, readers, scan_file
+from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.schema import check_log, check_raw
 from gyrostab.store.read import MIN_LAZY_VALUES
 from gyrostab.time.grid import TimeGridIndex, time_coordinate
@@ -172,6 +173,59 @@ def test_a_copy_in_another_unit_with_fewer_digits_and_damage_is_a_copy(
     assert any(
         note.startswith("a.csv: 60 rows of b.csv are here too") for note in raw.attrs["notes"]
     )
+
+
+OVERLAPPING = {
+    # columns and rows of each file
+    "axis": [("x", slice(0, 60)), ("xy", slice(0, 60))],
+    "channel": [("x", slice(0, 60)), ("xt", slice(0, 60))],
+    "channel within": [("x", slice(0, 60)), ("xt", slice(20, 40))],
+    "channel later": [("x", slice(0, 40)), ("xt", slice(20, 60))],
+    "axis earlier": [("xy", slice(0, 40)), ("x", slice(20, 60))],
+    "both": [("xy", slice(0, 40)), ("yz", slice(20, 60))],
+    "three": [("xy", slice(0, 30)), ("yz", slice(10, 50)), ("xzt", slice(40, 60))],
+}
+
+
+@pytest.mark.parametrize("files", OVERLAPPING.values(), ids=OVERLAPPING)
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_files_that_overlap_add_their_axes_and_channels(
+    tmp_path: Path, files: list[tuple[str, slice]], is_reversed: bool
+) -> None:
+    truth = np.round(np.random.default_rng(6).normal(size=(4, 60)), 3)
+    filled = np.zeros((4, 60), dtype=bool)
+    headers = {**{axis: f"gyro_{axis} [deg/h]" for axis in "xyz"}, "t": "temperature [degC]"}
+    paths = []
+    for place, (columns, rows) in enumerate(files):
+        numbers = ["xyzt".index(name) for name in columns]
+        filled[numbers, rows] = True
+        lines = [",".join(map(str, [k, *truth[numbers, k]])) for k in range(60)[rows]]
+        header = ",".join(["time [s]", *(headers[name] for name in columns)])
+        paths.append(write(tmp_path / f"{place}.csv", "\n".join([header, *lines, ""])))
+    log = regularise(read_log(paths[::-1] if is_reversed else paths))
+    assert log.sizes["time"] == 60
+    expected = np.where(filled, truth, np.nan)
+    for axis in "xyz":
+        if filled["xyz".index(axis)].any():
+            np.testing.assert_array_equal(log.rate.sel(axis=axis), expected["xyz".index(axis)])
+    if filled[3].any():
+        temperature = log.temperature.rename({log.temperature.dims[0]: "time"})
+        np.testing.assert_array_equal(temperature.dropna("time"), truth[3][filled[3]])
+        seconds = temperature.dropna("time").time.values.astype(np.int64) // 10**9
+        np.testing.assert_array_equal(seconds, np.flatnonzero(filled[3]))
+    assert not any("no row holds" in note for note in log.attrs["notes"])
+
+
+def test_of_a_damaged_file_and_its_copy_the_copy_is_read(
+    tmp_path: Path, values: np.ndarray
+) -> None:
+    damaged = [
+        line.replace(",", ",*" * (n % 20 == 3) or ",", 1)
+        for n, line in enumerate(_rows(values, slice(None)).splitlines())
+    ]
+    first = write(tmp_path / "a.csv", HEADER + "\n".join(damaged))
+    second = write(tmp_path / "b.csv", HEADER + _rows(values, slice(None)))
+    np.testing.assert_array_equal(read_log([first, second]).rate, read_log(second).rate)
 
 
 def test_restarted_clock_in_the_next_file_is_not_an_overlap(

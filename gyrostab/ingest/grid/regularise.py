@@ -144,6 +144,27 @@ def _end_gaps_later(table: NDArray[np.int64], size: int) -> NDArray[np.int64]:
     return later
 
 
+def _drop_empty_channels(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
+    """Drop the channels on ``row`` of each part that hold no number there, but do in another."""
+    filled_names = [
+        {
+            key
+            for key, variable in part.data_vars.items()
+            if variable.dims == ("row",)
+            and any(
+                np.isfinite(read_slice(variable.data, begin, begin + BLOCK_ROWS)).any()
+                for begin in range(0, part.sizes["row"], BLOCK_ROWS)
+            )
+        }
+        for part in parts
+    ]
+    known_names = set().union(*filled_names)
+    return [
+        part.drop_vars((known_names - names) & set(part.data_vars))
+        for part, names in zip(parts, filled_names, strict=True)
+    ]
+
+
 def _describe_axes(
     axis_rows: Sequence[Any], parts: Sequence[xr.Dataset], logs: Sequence[xr.Dataset]
 ) -> tuple[list[str], str]:
@@ -234,7 +255,7 @@ def regularise(
     check_raw(raw)
     if "axis_rows" in raw.attrs:
         options: dict[str, Any] = {"max_gap": max_gap, "limits": limits}
-        parts = [part.assign_attrs(notes=[]) for part in split_axes(raw)]
+        parts = [part.assign_attrs(notes=[]) for part in _drop_empty_channels(split_axes(raw))]
         logs = [regularise(part, rate=rate, **options) for part in parts]
         labels, note = _describe_axes(raw.attrs["axis_rows"], parts, logs)
         log = concatenate_logs(logs, labels, **options)
