@@ -36,6 +36,8 @@ from gyrostab.ingest.grid.starting_period import (
     Stamps,
     clock_tick,
     comb_peaks,
+    fill_stamps,
+    find_by_rows,
     find_steps,
     finer_period,
     losses_accumulate,
@@ -137,7 +139,8 @@ def _estimate_ordered(stamps: Stamps, stretches: Parts, parts: Parts, sure: floa
     """Find the sampling rate of stamps that mostly rise; a damaged file may give a negative one."""
     steps = find_steps(parts)
     period, counted, coarse = starting_period(stretches)
-    finer = None if counted else finer_period(parts, period)
+    filled = [fill_stamps(stretch) for stretch in stretches]
+    finer = None if counted else finer_period(filled, period)
     lost = None if finer is None else _estimate_sharp(stamps, parts, SECOND / finer)
     if lost is not None:
         return replace(lost, even=float(f"{SECOND / time_per_row(stretches):.4g}"))
@@ -334,28 +337,27 @@ def deviating_stretches(stamps: Stamps, period: float) -> list[DeviatingStretch]
     stretches: list[DeviatingStretch] = []
     inside = False
     for rows, values in recut_blocks(stamps, 64 * _STRETCH):
-        is_readable = values != NO_STAMP
-        rows, values = rows[is_readable], values[is_readable]
-        begins, paces = _stretch_paces(values)
+        readable = np.flatnonzero(values != NO_STAMP)
+        begins, paces = _stretch_paces(values[readable])
         deviations = np.abs(paces / period - 1)
         if not (deviations >= _MIN_DEVIATION).any():
             inside = False if len(deviations) else inside
             continue
         for begin, deviation in zip(begins.tolist(), deviations.tolist(), strict=True):
-            part = values[begin : begin + _STRETCH]
+            places = readable[begin : begin + _STRETCH]
+            part = values[places[0] : places[-1] + 1]
             own_period: float | None = None
             if deviation >= _MAX_TRACKED_DEVIATION:  # steps of 1.25 samples would be losses
-                own_period = period_of_lines([part])
+                _, own_period = find_by_rows([part], period_of_lines)
             elif deviation >= _MIN_DEVIATION:
-                own_period = track_period([part], period)
+                own_period = track_period([values[places]], period)
             is_deviating = own_period is not None and _is_other_period(own_period, period)
             if is_deviating and own_period is not None:
-                last = begin + len(part) - 1
-                end = int(rows[last]), int(part[-1])
+                end = int(rows[places[-1]]), int(part[-1])
                 if inside and not _is_other_period(own_period, SECOND / stretches[-1].rate):
                     stretches[-1] = stretches[-1]._replace(last=end)
                 else:
-                    first = int(rows[begin]), int(part[0])
+                    first = int(rows[places[0]]), int(part[0])
                     stretches.append(DeviatingStretch(first, end, SECOND / own_period))
             inside = is_deviating
     return stretches

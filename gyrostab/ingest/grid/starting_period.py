@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +33,15 @@ _PEAK_WIDTH = 0.02  # relative distance of two peaks, at least
 #: independent steps below which they do not.
 _MIN_SPAN_ROWS, _SPAN_ROWS, _MIN_ACCUMULATION = 16, 256, 0.2
 
+#: Ratio to the mean time per row from which on a period is not that of the rows.
+_LONGER = 1.05
+
 #: Least share of the steps that are pauses, of rows in bursts or packets.
 _MIN_PAUSE_SHARE = 0.02
 
 Integers = NDArray[np.int64]
 Parts = list[Integers]
+_Period = TypeVar("_Period", float, float | None)
 #: Rows and their stamps, or the stamps that are used of some rows.
 Block = tuple[Integers, Integers]
 #: Returns a new iterator over all blocks of row numbers and stamps at each call.
@@ -78,6 +83,24 @@ def readable_stamps(block: Integers) -> Integers:
     """Return the readable stamps, without a copy if all are readable."""
     is_readable = block != NO_STAMP
     return block if is_readable.all() else block[is_readable]
+
+
+def fill_stamps(block: Integers) -> Integers:
+    """Return the stamps from the first to the last readable one, the others evenly between them.
+
+    Examples
+    --------
+    >>> fill_stamps(np.array([NO_STAMP, 10, NO_STAMP, NO_STAMP, 40, 50]))
+    array([10, 20, 30, 40, 50])
+    """
+    rows = np.flatnonzero(block != NO_STAMP)
+    if len(rows) in (0, len(block)):
+        return block[: len(rows)]
+    stamps, first = block[rows], block[rows[0]]
+    between = np.interp(np.arange(rows[0], rows[-1] + 1), rows, stamps - first)
+    filled: Integers = np.rint(between).astype(np.int64) + first
+    filled[rows - rows[0]] = stamps
+    return filled
 
 
 def find_steps(parts: Parts) -> Integers:
@@ -239,10 +262,35 @@ def starting_period(stretches: Parts) -> tuple[float, bool, bool]:
     The stretches are those of `sample_stretches`.
     """
     parts = [readable_stamps(stretch) for stretch in stretches]
+    if _has_shared_stamps(parts, find_steps(parts).astype(np.float64)):
+        return time_per_row(stretches, ticks=True), True, True
+    parts, period = find_by_rows(stretches, _stamped_period)
+    return (
+        (time_per_row(stretches), True, False)
+        if _is_bursty(parts, find_steps(parts).astype(np.float64), period)
+        else (period, False, False)
+    )
+
+
+def find_by_rows(stretches: Parts, find: Callable[[Parts], _Period]) -> tuple[Parts, _Period]:
+    """Return the period [ns] that `find` finds from the stamps, and the stamps that it used.
+
+    These are the readable ones. If the period is longer than the mean time per row, few successive
+    rows have one, as where only the first row of a packet has; all rows are used then.
+    """
+    parts = [readable_stamps(stretch) for stretch in stretches]
+    period = find(parts)
+    has_all = sum(map(len, parts)) == sum(map(len, stretches))
+    if has_all or period is None or period < _LONGER * time_per_row(stretches):
+        return parts, period
+    filled = [fill_stamps(stretch) for stretch in stretches]
+    return filled, find(filled)
+
+
+def _stamped_period(parts: Parts) -> float:
+    """Return the period [ns] of stamps near multiples of it."""
     steps = find_steps(parts).astype(np.float64)
     rising = steps[steps > 0]
-    if _has_shared_stamps(parts, steps):
-        return time_per_row(stretches, ticks=True), True, True
     period = period_of_lines(parts)
     if period is None:
         period = _refine_period(steps, float(np.quantile(rising, 0.5, method="lower")))
@@ -254,11 +302,7 @@ def starting_period(stretches: Parts) -> tuple[float, bool, bool]:
             # milliseconds are also multiples of a millisecond
             single = np.argmax(np.bincount(np.rint(rising / shorter).clip(0, 50).astype(int))) == 1
             period = shorter if single and rms_misfit(steps, shorter) < 0.15 else period
-    return (
-        (time_per_row(stretches), True, False)
-        if _is_bursty(parts, steps, period)
-        else (period, False, False)
-    )
+    return period
 
 
 def _is_bursty(parts: Parts, steps: NDArray[np.float64], period: float) -> bool:

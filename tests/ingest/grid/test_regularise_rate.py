@@ -69,6 +69,24 @@ def test_bursts_are_placed_by_count_and_a_loss_shows_as_a_lasting_delay():
     assert np.abs(present - samples).max() <= 10
 
 
+@pytest.mark.parametrize(
+    "readable", [[1, 0], [1, 0, 0, 0], [1, 1, 0], [1, 1, 0, 0], [1, 1, 1, 0, 0]], ids=str
+)
+@pytest.mark.parametrize("jitter", [0.0, 0.05])
+def test_stamps_in_some_rows_of_each_packet_say_the_rate_of_all_rows(readable, jitter):
+    n = 4000
+    samples = np.arange(n) + jitter * np.random.default_rng(4).normal(size=n)
+    stamps = np.where(np.resize(readable, n), stamps_of(samples, 100.0), NO_STAMP)
+    log = regularise(raw_log(stamps))
+    assert log.attrs["sampling_rate_hz"] == pytest.approx(100.0, rel=1e-5)
+    present = np.isfinite(log.rate.values[0])
+    assert present.all()
+    assert n - 3 <= present.size <= n  # the last rows have no stamp
+    assert abs(log.time.values[0].astype(np.int64) - stamps[0]) <= 5_000_000
+    assert "rate_changes" not in log.attrs
+    assert not any("Hz" in note for note in log.attrs["notes"])
+
+
 @pytest.mark.parametrize("share", first_of(0.2, 0.05))
 @pytest.mark.parametrize("clock", ["bursts", "tenths", "jitter"])
 def test_rows_without_a_readable_stamp_count(clock, share):
