@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import TimeError
-from gyrostab.ingest.columns.pieces import find_line
+from gyrostab.ingest.columns.pieces import find_even, find_line
 from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.concat.place import Match, count_alike
 from gyrostab.ingest.grid.jitter import MIN_SIGMA, JitterModel
@@ -40,6 +40,7 @@ from gyrostab.time.grid import period_ns
 from gyrostab.time.stamps import stamp_ns
 
 _MAX_RATE_DIFFERENCE = 0.02  # relative, between declared and estimated rate
+_MANY_ROWS = 1000  # whose stamps suffice for the rate, whichever rows have no number
 # Largest jitter at which stamps give the samples of 99 % of the rows; placing by stamp is then
 # tried first [samples].
 _SHARP_SIGMA = 0.2
@@ -102,6 +103,8 @@ class RowPlacer:
             if declared is None or scanned.rows - scanned.absent > 1:
                 raise
             estimate = RateEstimate(declared, 0.0, counted=False, coarse=False, raw=declared)
+        if declared is None:
+            estimate = self._estimate_by_rows(stamps, estimate)
         rate, notes = estimate.rate, list[str]()
         if declared is not None:
             if abs(declared / estimate.raw - 1) > _MAX_RATE_DIFFERENCE:
@@ -143,6 +146,23 @@ class RowPlacer:
         runs = [np.array([[0, 0, self.scanned.rows]], dtype=np.int64)]
         placement = make_placement(stamp_ns(text) if text else 0, self.declared, runs, [])
         return placement, [] if text else [note]
+
+    def _estimate_by_rows(self, stamps: Stamps, estimate: RateEstimate) -> RateEstimate:
+        """Estimate the rate of a short log that has rows without a number at even stamps.
+
+        If successive rows have numbers, the rate is that of all rows. The stamps of a few hundred
+        rows with random losses between them also fit other rates, with jitter.
+        """
+        if not self.scanned.absent or self.scanned.rows > _MANY_ROWS:
+            return estimate
+        present = np.flatnonzero(self.scanned.mask(0, self.scanned.rows))
+        all_stamps = read_stamps(self.raw, int(present[0]), int(present[-1]) + 1)
+        line = find_line([find_even(all_stamps.view("datetime64[ns]"))])
+        rate = SECOND / line[1] if line is not None and line[1] > 0 else estimate.raw
+        if abs(rate / estimate.raw - 1) <= _MAX_RATE_DIFFERENCE:
+            return estimate
+        by_rows = estimate_near(stamps, rate)
+        return by_rows if by_rows is not None and by_rows.jitter is None else estimate
 
     def _estimate_declared(
         self, stamps: Stamps, estimate: RateEstimate, declared: float

@@ -87,6 +87,27 @@ def test_stamps_in_some_rows_of_each_packet_say_the_rate_of_all_rows(readable, j
     assert not any("Hz" in note for note in log.attrs["notes"])
 
 
+def test_short_log_with_rows_without_a_number_has_the_rate_of_its_rows():
+    random = np.random.default_rng(1)
+    for n in (60, 150, 300, 500):
+        for share in (0.2, 0.3, 0.4):
+            values = np.where(random.random(n) < share, np.nan, np.arange(n) + 1.0)
+            present = np.flatnonzero(np.isfinite(values))
+            stamps = stamps_of(np.arange(n), 100.0)
+            stamps[present[-1] + 1 :] = NO_STAMP
+            log = regularise(raw_log(stamps, values))
+            assert log.attrs["sampling_rate_hz"] == 100.0
+            inside = values[present[0] : present[-1] + 1]
+            assert np.array_equal(log.rate.values[0], inside, equal_nan=True)
+
+
+@pytest.mark.parametrize("period", [2, 10])
+def test_rows_without_a_number_between_all_others_do_not_count(period):
+    values = np.where(np.arange(300) % period, np.nan, np.arange(300) + 1.0)
+    log = regularise(raw_log(stamps_of(np.arange(300), 100.0), values))
+    assert log.attrs["sampling_rate_hz"] == 100.0 / period
+
+
 @pytest.mark.parametrize("share", first_of(0.2, 0.05))
 @pytest.mark.parametrize("clock", ["bursts", "tenths", "jitter"])
 def test_rows_without_a_readable_stamp_count(clock, share):
