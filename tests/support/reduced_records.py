@@ -91,6 +91,7 @@ def records(base: xr.Dataset, count: int, rng: np.random.Generator, **options: A
     data: dict[str, Any] = {
         "mean": (plane, _draw_means(base, count, rng, f)),
         "samples": (("axis", "block"), np.full((axes, block_count), f["samples"])),
+        "neighbours": (("axis", "block"), np.ones((axes, block_count))),  # gaps are apart
         "power": (cube, power),
         "shape": (("axis", "block", "band"), shape),
         "line_power": (("record", "axis", "part", "line"), lines),
@@ -124,6 +125,7 @@ def records(base: xr.Dataset, count: int, rng: np.random.Generator, **options: A
     attrs = {
         "sampling_rate_hz": f["rate"],
         "block_s": f["block_s"],
+        "block_samples": round(f["block_s"] * f["rate"]),
         "start_ns": 1_790_000_000_000_000_000,
     }
     return xr.Dataset(data, coords=coords, attrs=attrs)

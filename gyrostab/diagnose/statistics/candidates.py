@@ -208,9 +208,10 @@ def _nuisance_grid(kind: type[Effect], windows: Windows) -> Iterator[dict[str, A
 
 def largest_size(effect: str, settings: Settings) -> float:
     """Return the largest size that hides in noise or is plausible, infinite for most effects."""
+    rates = (item.high for item in effects()["earth_rate"].parameters() if item.name == "rate")
     return {
         "misalignment": 1e3 * settings.max_misalignment_share,  # mrad
-        "earth_rate": effects()["earth_rate"].parameters()[0].high,
+        "earth_rate": next(rates),
     }.get(effect, math.inf)
 
 

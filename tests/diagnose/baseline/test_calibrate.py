@@ -11,6 +11,7 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.expected_statistics import (
     common_variance,
     noise_powers,
+    reduced_shape,
     white_variance,
 )
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
@@ -457,3 +458,19 @@ def test_the_order_of_the_axes_does_not_matter():
     )
     for name in ("square", "mean_variance", "grid_K", "grid_B", "posterior"):
         np.testing.assert_array_equal(back[name].sel(axis=["x", "y", "z"]), forth[name])
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.3, 0.5])
+def test_degrees_of_freedom_of_a_block_are_those_that_losses_leave(lost):
+    """The scatter of the level of white noise over 1080 blocks, of which bands vary together."""
+    rng = np.random.default_rng(8)
+    rates = rng.standard_normal((3, 72_000))
+    rates[:, rng.random(72_000) < lost] = np.nan
+    blocks = reduce_log(make_log(rates, rate=10.0, unit="deg/h"), block="20s")
+    power, shape = blocks["power"].values, blocks["shape"].values
+    level = (shape * power).sum(axis=2) / shape.sum(axis=2)
+    scatter = level.var() / level.mean() ** 2
+    expected = (1.0 / reduced_shape(blocks).sum(axis=2)).mean()
+    assert scatter == pytest.approx(expected, rel=0.25)
+    if lost == 0.5:
+        assert scatter > 1.4 * (1.0 / shape.sum(axis=2)).mean()
