@@ -89,15 +89,18 @@ def order_rivals(
     state: State,
     examination: Examination,
 ) -> list[str]:
-    """Return the effects that come close to the best, plainer ones first."""
+    """Return the effects that come close to the best, plainer ones first.
+
+    The evidence of a size grows with its square, and so does what an error of its form costs. That
+    of a random walk has no such error: another walk that explains more is another one.
+    """
     settings = examination.settings
     best = sum_evidence(components[passing[0]])
-    min_nats = best - settings.ambiguous_nats - settings.form_error_share * best
-    rivals = [
-        key
-        for key in passing
-        if not key.startswith("~") and sum_evidence(components[key]) >= min_nats
-    ]
+    rivals = []
+    for key in passing:
+        error = settings.form_error_share * best * components[key][0].statistic.has_size
+        if sum_evidence(components[key]) >= best - settings.ambiguous_nats - error:
+            rivals += [] if key.startswith("~") else [key]
     effects = {components[key][0].candidate.effect for key in rivals}
     is_later = {
         key: _is_on_single_axis(components[key], examination.candidates)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -9,8 +12,12 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify.components import sum_evidence
+from gyrostab.diagnose.identify.naming_order import order_rivals
+from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.settings import DEFAULTS
+from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.simulate import simulate
 from tests.support.candidates import find_components
@@ -36,6 +43,27 @@ def shaken_log(seed: int, effects: tuple[dict[str, object], ...]) -> xr.Dataset:
 
 
 WALK = {"name": "vibration_random_walk", "sensitivity": 0.15}
+
+
+def test_a_steady_walk_that_explains_more_is_not_that_of_vibration():
+    """A size may have an error of form, which costs 1 % of the evidence here; a walk has none."""
+    walk, mean = find_statistic("random_process"), find_statistic("mean")
+    variant = Variant({}, ("size",), np.ones((1, 1, 4)))
+    components = {
+        name: [Component(Candidate(name, statistic, driver, (variant,)), variant, ("x",), nats)]
+        for name, statistic, driver, nats in (
+            ("~red", walk, (), 1000.0),
+            ("vibration_random_walk", walk, ("vibration",), 995.0),
+            ("temperature_bias", mean, ("temperature",), 992.0),
+        )
+    }
+    examination = SimpleNamespace(settings=DEFAULTS, candidates=[])
+    assert order_rivals(list(components), components, None, examination) == ["temperature_bias"]
+    components["~red"] = [replace(components["~red"][0], evidence_nats=997.0)]
+    assert order_rivals(list(components), components, None, examination) == [
+        "vibration_random_walk",
+        "temperature_bias",
+    ]
 
 
 @pytest.mark.parametrize("seed", first_of(1, 2, 3))
