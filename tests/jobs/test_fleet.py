@@ -81,14 +81,17 @@ def done(archive, tmp_path_factory) -> Path:
     return output
 
 
-def test_reports_that_are_missing_are_written_and_tools_are_those_of_the_call(tmp_path):
+def test_missing_reports_are_written_and_tools_are_those_of_the_call(tmp_path, computed):
     write_log(tmp_path / "in" / "SN7" / "r1.nc", 6)
-    run_fleet([tmp_path / "in"], tmp_path / "out", **OPTIONS)
-    table = run_fleet(
-        [tmp_path / "in"], tmp_path / "out", **{**OPTIONS, "reports": True, "tool": "[0-9]"}
-    )
-    assert list(table["tool"]) == ["7"]
+    paths = [tmp_path / "in"], tmp_path / "out"
+    run_fleet(*paths, **OPTIONS)
+    table = run_fleet(*paths, **{**OPTIONS, "reports": True})
+    assert list(table["tool"]) == [""]
     assert (tmp_path / "out" / "reports" / f"{table['run'][0]}.html").exists()
+    computed.clear()
+    table = run_fleet(*paths, **{**OPTIONS, "reports": True, "tool": "[0-9]"})
+    assert list(table["tool"]) == ["7"]
+    assert not computed
 
 
 # ------------------------------------------------------------------------------

@@ -60,7 +60,7 @@ def test_noise_that_fluctuates_on_one_axis_stays_named_on_the_others(monkeypatch
     )
     selection = Selection("vibration_noise", ("vibration",), ("x", "y", "z"), components, 227.0, 8)
     monkeypatch.setattr(
-        withdrawal, "variance_fluctuation", lambda state, axis: 40.0 if axis == "x" else 0.0
+        withdrawal, "variance_fluctuation", lambda state, axis: 20.0 if axis == "x" else 0.0
     )
     examination = Examination(
         [], fold_blocks(blocks), CountEvidence({}), 8.0, start, (), np.zeros(1), {}

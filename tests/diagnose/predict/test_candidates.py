@@ -314,10 +314,8 @@ def test_nuisance_alternatives_have_the_axes_of_the_record(plain):
 
 def test_a_constant_white_level_is_no_candidate_on_several_axes():
     """Lost samples add white noise at a constant level, whatever the N of each axis."""
-    held = [
-        known
-        for known in effect_candidates(record([]), COEFFICIENT)[0]
-        if known.effect == "held_samples"
-    ]
+    differing = COEFFICIENT * xr.DataArray([1.0, 2.0, 3.0], dims="axis")
+    known_effects, _ = effect_candidates(record([]), differing)
+    held = [known for known in known_effects if known.effect == "held_samples"]
     assert held
     assert not any(known.statistic.is_power for known in held)
