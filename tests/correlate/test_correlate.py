@@ -234,7 +234,7 @@ def test_rate_of_change_is_a_driver_only_if_it_is_named_with_others():
 
 
 def probe_of(product: xr.Dataset, *, degrees: float) -> xr.DataArray:
-    """Make a channel like that of a file, with its own times, beside the temperature."""
+    """Make a channel like that of a file, with its own times, near the temperature."""
     values = degrees + product["temperature"].values
     times = {"time_probe": product["time"].values}
     return xr.DataArray(values, times, ["time_probe"], "temperature", {"units": "degC"})

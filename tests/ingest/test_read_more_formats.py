@@ -254,6 +254,11 @@ def test_segments_of_tdms_with_other_starts_are_noted(
             writer.write_segment(axes)
     notes = read_log(tmp_path / "run.tdms").attrs["notes"]
     assert any("write a file for each start" in note for note in notes) == is_noted
+    unfinished = bytearray((tmp_path / "run.tdms").read_bytes())
+    size = slice(unfinished.rindex(b"TDSm") + 12, unfinished.rindex(b"TDSm") + 20)
+    unfinished[size] = 8 * b"\xff"  # of a segment that the program did not close
+    (tmp_path / "run.tdms").write_bytes(unfinished)
+    assert read_log(tmp_path / "run.tdms").sizes["row"] == 18
 
 
 LAYOUT = """

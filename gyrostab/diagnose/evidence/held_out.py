@@ -2,10 +2,10 @@
 
 The data are block means, ``y ~ Normal(X beta, V)`` with V from
 `gyrostab.kernels.regression.state_space`, and band powers, ``P / S - 1 ~ Normal(X beta, 1 /
-shape)`` in every cell. Factors beta have a normal prior whose width is one of `WIDTHS` times the
-error of beta in white noise. Widths, and random walk K and flicker B on a grid, are averaged over.
-A design therefore enters only by products of whitened columns. They take time linear in the number
-of blocks, and records with the same gaps share them.
+shape)`` in every cell. Factors beta have a normal prior whose width is one of `prior_widths` times
+the error of beta in white noise. Widths, and random walk K and flicker B on a grid, are averaged
+over. A design therefore enters only by products of whitened columns. They take time linear in the
+number of blocks, and records with the same gaps share them.
 
 A *design* is an array of columns, a *candidate* a list of designs, one for every value of its
 nuisance parameters, of equal weight. The *factor* of a design is its log Bayes factor against the

@@ -27,9 +27,9 @@ from gyrostab.time.stamps import to_nanoseconds
 _FIRST_DATE = np.datetime64(
     "1950-01-01", "us"
 )  # LabVIEW counts from 1904, and writes 1904 if it has no clock
-#: Bytes before the metadata of a segment, flag of its byte order, and largest segment: one that was
-#: not finished has the largest 64-bit number.
-_LEAD_BYTES, _BIG_ENDIAN, _MAX_SEGMENT_BYTES = 28, 0x40, 2**48
+#: Bytes before the metadata of a segment, flag of its byte order, and largest metadata that are
+#: searched.
+_LEAD_BYTES, _BIG_ENDIAN, _MAX_METADATA_BYTES = 28, 0x40, 2**24
 #: Paths of channels, and start times (of type 0x44) after them, in the metadata of a segment.
 _STARTS = re.compile(
     rb"(?s)(?P<channel>/'[^\0-\x1f]*'/'[^\0-\x1f]*')"
@@ -60,13 +60,14 @@ def _describe_starts(path: Path) -> list[str]:
     """Return a note if a channel begins again in a later segment, as the library merges them."""
     starts = defaultdict[bytes, set[bytes]](set)
     with path.open("rb") as file:
-        while len(lead := file.read(_LEAD_BYTES)) == _LEAD_BYTES:
+        while len(lead := file.read(_LEAD_BYTES)) == _LEAD_BYTES and lead.startswith(b"TDSm"):
             size, metadata = struct.unpack(">QQ" if lead[4] & _BIG_ENDIAN else "<QQ", lead[12:])
             begin, channel = file.tell(), b""
-            for part in _STARTS.finditer(file.read(min(metadata, size, _MAX_SEGMENT_BYTES))):
+            for part in _STARTS.finditer(file.read(min(metadata, size, _MAX_METADATA_BYTES))):
                 channel = part["channel"] or channel
                 starts[channel].update([part["start"]] if part["start"] else [])
-            file.seek(begin + min(size, _MAX_SEGMENT_BYTES))
+            # a segment that was not finished has the largest 64-bit number for its size
+            file.seek(min(begin + size, path.stat().st_size))
     if all(len(times) < 2 for times in starts.values()):
         return []
     return [

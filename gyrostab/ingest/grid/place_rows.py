@@ -122,7 +122,7 @@ class RowPlacer:
                 deviating = deviating_stretches(stamps, 1e9 / rate)
         doubled = doubled[~np.isin(doubled[:, 0], placement.events[:, 2])]  # without longer ones
         if len(doubled):
-            placement = _with_duplicates(placement, [_duplicates(placement, *doubled.T)])
+            placement = _with_duplicates(placement, [_duplicate_events(placement, *doubled.T)])
         notes += describe_rate(raw, estimate, deviating, placement)
         changes = tuple(
             end[1]
@@ -337,12 +337,12 @@ def with_repeats(placement: Placement, raw: xr.Dataset, repeats: Integers) -> Pl
     tables = []
     for row, source, length in repeats.tolist():
         rows, stamps = np.arange(length), read_stamps(raw, row, row + length)
-        table = _duplicates(placement, rows + row, rows + source, stamps)
+        table = _duplicate_events(placement, rows + row, rows + source, stamps)
         tables.append(table[stamps != NO_STAMP])
     return _with_duplicates(placement, tables)
 
 
-def _duplicates(
+def _duplicate_events(
     placement: Placement, rows: Integers, source: Integers, stamps: Integers
 ) -> Integers:
     """Return events of rows that repeat those of `source`."""
