@@ -281,9 +281,11 @@ def test_curves_of_witsml_1_3_are_in_the_order_of_their_numbers(tmp_path: Path) 
     assert raw.temperature.values.tolist() == [60, 61]
 
 
-def test_cells_of_witsml_are_separated_by_its_delimiter(tmp_path: Path) -> None:
-    block = list_witsml("TIME|gyro_x|temperature", "0|1|60", "1|2|61")
-    raw = read_small_witsml(tmp_path, block, log="<dataDelimiter>|</dataDelimiter>")
+@pytest.mark.parametrize("mark", ["|", "||"])
+def test_cells_of_witsml_are_separated_by_its_delimiter(tmp_path: Path, mark: str) -> None:
+    rows = ("TIME,gyro_x,temperature", "0,1,60", "1,2,61")
+    block = list_witsml(*(row.replace(",", mark) for row in rows))
+    raw = read_small_witsml(tmp_path, block, log=f"<dataDelimiter>{mark}</dataDelimiter>")
     assert raw.rate[0].values.tolist() == [1, 2]
 
 

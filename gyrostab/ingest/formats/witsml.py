@@ -9,6 +9,7 @@ Energistics, WITSML data schema 1.4.1.1, object log.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from io import StringIO
 from pathlib import Path
@@ -89,7 +90,8 @@ def _read_block(log: Any, block: Any, curves: Mapping[str, Any]) -> pd.DataFrame
     }
     cells = pd.read_csv(
         StringIO("\n".join(_fit_row(line, delimiter, len(names)) for line in lines)),
-        sep=delimiter,
+        # pandas takes more than one character for a regular expression
+        sep=delimiter if len(delimiter) == 1 else re.escape(delimiter),
         header=None,
         names=range(len(names)),
         index_col=False,
