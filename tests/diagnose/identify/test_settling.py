@@ -165,3 +165,18 @@ def test_rejected_channels_do_not_use_up_the_number_of_effects(monkeypatch):
     selecting._select_all(SimpleNamespace(start=None, expected=()))
     # the last round is repeated with what is tried last
     assert next(rounds) == 2 * selecting.MAX_EFFECTS + 2
+
+
+def test_what_fails_the_time_shift_test_is_barred_before_random_biases_are_tried(monkeypatch):
+    tried: list[tuple[set[str], bool]] = []
+    answers = iter([([], {"shupe": ("a time-shifted channel", 3.0)}), None, None])
+    monkeypatch.setattr(
+        selecting,
+        "score_candidates",
+        lambda examination, state, barred, with_last: tried.append(({*barred}, with_last)),
+    )
+    monkeypatch.setattr(selecting, "_select_next", lambda *given: next(answers))
+    chosen, beaten = selecting._select_all(SimpleNamespace(start=None, expected=()))
+    assert not chosen
+    assert list(beaten) == ["shupe"]
+    assert tried == [(set(), False), ({"shupe"}, False), ({"shupe"}, True)]
