@@ -188,7 +188,9 @@ def averaging_factors(
     longest = window // order
     limit = 2 * window // (3 * order)
     if tau_max is not None:
-        limit = int(duration_seconds(tau_max, "tau_max") * rate * (1 + PRINTED_DIGITS) + 1e-6)
+        asked = duration_seconds(tau_max, "tau_max") * rate
+        nearest = round(asked)
+        limit = nearest if nearest <= asked * (1 + PRINTED_DIGITS) else int(asked)
         if limit > longest or limit < 1:
             raise OptionError(
                 f"tau_max of {limit / rate:g} s does not fit the window of {window / rate:g} s; "

@@ -64,6 +64,12 @@ def test_printed_averaging_times_are_found_again():
         assert averaging_factors("all", rate=300.0, window=10_000, tau_max=tau)[-1] == factor
 
 
+def test_half_of_a_long_window_fits_as_longest_averaging_time():
+    """The error of printed digits is several samples here, and must not lengthen the limit."""
+    factors = averaging_factors(20, rate=100.0, window=1_000_000, tau_max="5000s")
+    assert factors[-1] == 500_000
+
+
 def test_tau_max_limits_a_list():
     factors = averaging_factors(["1s", "4s"], rate=100.0, window=1000, tau_max="2s")
     assert factors.tolist() == [100]
