@@ -52,6 +52,9 @@ _CURVATURE_STEP = 0.02
 #: shortest averaging time, at most, and anywhere below the band limit, at most: a spectral line or
 #: resets of a feedback loop exceed the latter.
 _MAX_SHORTEST_RATIO, _MAX_RATIO = 0.9, 1.05
+#: Least share of what a first-order low-pass removes at the shortest averaging time: white noise
+#: that changes its level seems to lack a little power at all short averaging times.
+_MIN_REMOVED_SHARE = 0.5
 #: Largest Allan variance of a window over the median at any averaging time: a window above it holds
 #: motion.
 _MAX_WINDOW_RATIO = 10.0
@@ -90,6 +93,21 @@ def filter_response(tau: Array, time_constant: float | Array) -> Array:
     array([0.7 , 0.97])
     """
     return np.asarray(1.0 - 1.5 * time_constant / tau)
+
+
+def low_pass_response(tau: float, time_constant: float) -> float:
+    """Compute the share of the Allan variance of white noise that a first-order low-pass leaves.
+
+    At any averaging time; `filter_response` is its limit for long ones.
+
+    Examples
+    --------
+    >>> round(low_pass_response(10.0, 1.0), 4), round(low_pass_response(0.01, 1.0), 6)
+    (0.85, 3.3e-05)
+    """
+    ratio = tau / time_constant if time_constant > 0.0 else np.inf
+    shares = [1.0 - np.exp(-ratio), 1.0 - np.exp(-2.0 * ratio)]
+    return float(1.0 - (2.0 * shares[0] - 0.5 * shares[1]) / ratio)
 
 
 def limit_response(product: xr.Dataset, tau: Array) -> Array:
@@ -167,8 +185,9 @@ def find_band_limit(
         if probability >= _MIN_PROBABILITY:
             unfiltered = tables.columns[:start, 1:4] @ squares[1:4] * mean.rows[1][:start]
             ratio = mean.rows[0][:start] / unfiltered
-            lacks_power = ratio[0] < _MAX_SHORTEST_RATIO and np.nanmax(ratio) < _MAX_RATIO
-            if not lacks_power:
+            removed = 1.0 - low_pass_response(tau[0], constant)
+            lacks_power = ratio[0] < min(_MAX_SHORTEST_RATIO, 1.0 - _MIN_REMOVED_SHARE * removed)
+            if not lacks_power or np.nanmax(ratio) > _MAX_RATIO:
                 return unlimited
             error = _find_white_error(mean, start, constant, allowed)
             return BandLimit(float(tau[start]), *map(_round_number, (constant, error)))

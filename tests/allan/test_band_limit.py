@@ -7,7 +7,7 @@ from scipy.signal import butter, firwin, lfilter
 
 import gyrostab
 from gyrostab.allan import fit
-from gyrostab.allan.band_limit import choose_windows, filter_response
+from gyrostab.allan.band_limit import choose_windows, filter_response, low_pass_response
 from gyrostab.allan.summary import describe_record, summarise_fit
 from gyrostab.jobs.run import run
 from tests.support.noise_records import flicker, lose, quantization, random_walk, white
@@ -111,6 +111,29 @@ def test_noise_without_a_filter_has_no_band_limit(terms):
     product = gyrostab.fit_noise(make_surface(x))
     assert product.filter_time_constant.item() == 0.0
     assert product.fit_tau_min.item() == float(product.tau[0])
+
+
+@pytest.mark.parametrize("seed", [0, 6, 8])
+def test_white_noise_that_changes_its_level_has_no_filter(seed):
+    """One window over the whole record, with three times the noise in its middle third."""
+    x = np.random.default_rng(seed).standard_normal(20_000)
+    x[6_667:13_334] *= 3.0
+    assert gyrostab.fit_noise(make_surface(x)).filter_time_constant.item() == 0.0
+
+
+def test_the_response_of_a_low_pass_is_that_of_its_autocorrelation():
+    """A pole of 0.99 at 100 Hz is a low-pass with a time constant of 0.995 s."""
+    k = np.arange(1, 4001)
+    power = 0.99 ** np.arange(8001)
+    # variance of the angle over m samples, of noise with unit density
+    lags = np.cumsum(power[1:] * np.arange(1, 8001)), np.cumsum(power[1:])
+    m = np.arange(1, 8001)
+    angle = m + 2.0 * (m * lags[1] - lags[0])
+    angle /= (1 + 0.99) / (1 - 0.99)
+    exact = (4.0 * angle[k - 1] - angle[2 * k - 1]) / (2.0 * k)
+    for place in (9, 99, 3999):
+        response = low_pass_response(k[place] / 100.0, 0.995)
+        assert response == pytest.approx(exact[place], rel=0.01)
 
 
 def test_each_axis_has_its_filter_and_gaps_and_motion_do_not_hide_it():
