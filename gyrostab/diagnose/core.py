@@ -28,6 +28,7 @@ from gyrostab.diagnose.identify.selection import identify_effects
 from gyrostab.diagnose.locate.mismatches import Region, locate_mismatches
 from gyrostab.diagnose.nulls.records import repeatable_null_records
 from gyrostab.diagnose.nulls.scores import NullScores, null_scores
+from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.aligned_channels import align_channels
 from gyrostab.diagnose.result.attribution import drop_expected
 from gyrostab.diagnose.result.diagnosis import Diagnosis
@@ -151,9 +152,7 @@ def _identify_with_late_channels(task: Task, block: Any) -> tuple[Task, NamedBlo
     channels = log_channels(task.log)
     delays = {name: delay_s for name, delay_s in known.items() if name in channels}
     reduced, named = _identify_with_delays(task, block, delays)
-    while late := find_late_channel(
-        named.examination, named.identifications, named.baseline, reduced.log, delays
-    ):
+    while late := find_late_channel(named.identifications, named.baseline, reduced.log, delays):
         channel, delay_s = late
         tried = {**delays, channel: delay_s}
         with warnings.catch_warnings():
@@ -237,7 +236,7 @@ def _identify_effects(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> N
         settings=task.settings,
     )
     identifications = settle_forms(identify_effects(examination), baseline)
-    return NamedBlocks(blocks, baseline, records, examination, identifications)
+    return NamedBlocks(blocks, baseline, records, identifications)
 
 
 def _without_lines(
@@ -251,7 +250,7 @@ def _without_lines(
 def _locate_mismatches(task: Task, named: NamedBlocks) -> tuple[list[Region], NullScores]:
     """Step 5: locate the mismatches, with the other half of the false-alarm level."""
     level = task.level / 2.0
-    blocks, baseline = named.examination.start.blocks, named.baseline
+    blocks, baseline = named.identifications.state.blocks, named.baseline
     identifications, expected = named.identifications, named.identifications.expected
     task.progress("comparing", 0)
     null = null_scores(baseline, named.null_records(), settings=task.settings)
@@ -308,10 +307,10 @@ def _leave_motion_out_of_lines(task: Task, named: NamedBlocks) -> NamedBlocks | 
     blocks, baseline = take_lines_at_rest(task, named.blocks, moving), named.baseline
     blocks_without_lines, records = _without_lines(task, blocks, baseline)
     # with the threshold of the null records so far
-    start = replace(named.examination.start, blocks=blocks_without_lines)
-    examination = replace(named.examination, start=start)
+    start = initial_state(blocks_without_lines, baseline, settings=task.settings)
+    examination = replace(identifications.examination, start=start)
     identifications = settle_forms(identify_effects(examination), baseline)
-    return NamedBlocks(blocks, baseline, records, examination, identifications)
+    return NamedBlocks(blocks, baseline, records, identifications)
 
 
 def _take_out_fast_switching(task: Task, named: NamedBlocks) -> NamedBlocks | None:

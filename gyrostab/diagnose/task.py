@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
-from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identification import Identifications
+from gyrostab.diagnose.identify.examination import Identifications
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.moving_blocks import without_motion
 from gyrostab.diagnose.settings import Settings
@@ -206,8 +205,8 @@ class NamedBlocks(NamedTuple):
     blocks: xr.Dataset
     baseline: xr.Dataset  # what the simulation predicts for the blocks
     null_records: Callable[[], Iterable[xr.Dataset]]  # the same ones on each call
-    examination: Examination  # of the blocks without the lines that the baseline contains
-    identifications: Identifications  # the effects that explain the differences
+    #: Effects that explain the blocks without the lines of the baseline.
+    identifications: Identifications
 
 
 def lines_without_motion(task: Task, blocks: xr.Dataset, known: xr.Dataset) -> xr.Dataset:

@@ -8,8 +8,10 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.evidence.folds import fold_blocks
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import group_components
-from gyrostab.diagnose.identify.identification import Identifications, Selection
+from gyrostab.diagnose.identify.examination import Examination, Identifications
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State, initial_state
@@ -52,9 +54,16 @@ def make_identifications(
     reasons: Mapping[str, str] | None = None,
 ) -> Identifications:
     """Return identifications as a selection would, with a threshold of 8 nats."""
-    return Identifications(
-        tuple(identified), (), 8.0, np.zeros(1), dict(reasons or {}), tuple(candidates), state
-    )  # type: ignore[arg-type]
+    examination = Examination(
+        tuple(candidates),
+        xr.DataArray(),
+        CountEvidence({}),
+        8.0,
+        state,  # type: ignore[arg-type]
+        null_best=np.zeros(1),
+        reasons=dict(reasons or {}),
+    )
+    return Identifications(examination, tuple(identified), (), state, tuple(candidates))  # type: ignore[arg-type]
 
 
 def identify_by_hand(

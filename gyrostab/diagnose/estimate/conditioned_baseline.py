@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.known_effects import EVERYWHERE
 from gyrostab.diagnose.estimate.joint_fit import Fitted
+from gyrostab.diagnose.identify.examination import Identifications
 from gyrostab.diagnose.identify.identification import (
-    Identifications,
     Selection,
     components_of,
     condition_on_selections,

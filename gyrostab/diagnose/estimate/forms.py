@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.identify.identification import Identifications, Selection
+from gyrostab.diagnose.identify.examination import Identifications
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.predict.average_sizes import choose_grid
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.grid_refinement import Point, refine_grid

@@ -14,7 +14,8 @@ from scipy.special import ndtr, ndtri
 from gyrostab.diagnose.estimate.filter_sizes import fit_filter_sizes
 from gyrostab.diagnose.estimate.split_components import group_axes, split_harmonics, split_steps
 from gyrostab.diagnose.identify.components import axes_of
-from gyrostab.diagnose.identify.identification import Identifications, Selection
+from gyrostab.diagnose.identify.examination import Identifications
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes
@@ -126,7 +127,9 @@ def _fit_identification(
         if fitted_together
         else [
             ([part for part in identification.components if set(axes) & set(part.row)], state)
-            for axes in group_axes(identification, state.blocks, identifications.count_evidence)
+            for axes in group_axes(
+                identification, state.blocks, identifications.examination.count_evidence
+            )
         ]
     )
     return [
@@ -248,7 +251,7 @@ def _estimate_sizes(
     """Return parameters with their errors from components in one statistic, and likely values."""
     # a step has its own grid of times, which ends where those of other steps begin
     candidates = () if components[0].is_step else identifications.candidates
-    fit = SizeFit(components, axes, state, candidates, identifications.count_evidence)
+    fit = SizeFit(components, axes, state, candidates, identifications.examination.count_evidence)
     return components[0].statistic.estimate(fit), fit.likeliest
 
 

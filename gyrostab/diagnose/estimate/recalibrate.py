@@ -32,11 +32,8 @@ from gyrostab.diagnose.baseline.posterior import (
 )
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.evidence.wandering import RandomProcesses, expected_processes
-from gyrostab.diagnose.identify.identification import (
-    Identifications,
-    components_of,
-    condition_on_selections,
-)
+from gyrostab.diagnose.identify.examination import Identifications
+from gyrostab.diagnose.identify.identification import components_of, condition_on_selections
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, spread_by_gaps

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gyrostab.diagnose.evidence.mixture import Mixture
-from gyrostab.diagnose.identify.identification import Identifications
+from gyrostab.diagnose.identify.examination import Identifications
 from gyrostab.diagnose.predict.average_sizes import plain_places
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import mean_columns
@@ -42,8 +42,8 @@ def find_upper_limits(identifications: Identifications) -> dict[str, dict[str, A
 def _limit_effect(kind: type[Effect], identifications: Identifications) -> dict[str, Any]:
     units = {item.name: item.unit for item in kind.parameters()}
     unit = next((units[name] for name in units if name in kind.size_parameters), "1")
-    if kind.name in identifications.reasons:
-        reason = identifications.reasons[kind.name]
+    if kind.name in identifications.examination.reasons:
+        reason = identifications.examination.reasons[kind.name]
         return {"upper_limit": math.nan, "unit": unit, "reason": reason}
     limits = [
         _limit_candidate(candidate, identifications.state)

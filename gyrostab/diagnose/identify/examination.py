@@ -1,8 +1,8 @@
-"""What all steps of the selection share: the record, the candidates, and the threshold."""
+"""What all steps of the selection share, the record and its candidates, and what they find."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -50,7 +50,8 @@ class Examination:
     threshold: float  # evidence [nats] that noise alone exceeds with the false-alarm probability
     start: State  # with the expected effects in the model, once they are identified
     known: tuple[Effect, ...] = ()  # effects that the simulation contains but not the baseline
-    null_best: Array = field(default_factory=lambda: np.empty(0))  # as in `Identifications`
+    #: Best evidence in each null record, sorted [nats].
+    null_best: Array = field(default_factory=lambda: np.empty(0))
     reasons: dict[str, str] = field(default_factory=dict)  # effect -> why it cannot show
     expected: tuple[Selection, ...] = ()  # those of the known effects that the record shows
 
@@ -89,6 +90,35 @@ class Examination:
         """Return the evidence that components need in addition to the selections [nats]."""
         others = [*self.expected, *selections]
         return self.threshold + form_error(components, others, settings=self.settings)
+
+
+@dataclass(frozen=True)
+class Identifications:
+    """What the identification found."""
+
+    examination: Examination  # with the expected effects in the model
+    identified: tuple[Selection, ...]  # the strongest first
+    unknown: tuple[Selection, ...]
+    state: State  # with all of the above, and the expected effects, in the model
+    candidates: tuple[Candidate, ...]  # all that were tried, for the noise of the state
+    #: Effects that the simulation contains as well, with size and time from the recording.
+    expected: tuple[Selection, ...] = ()
+    #: Key of each candidate that passed the threshold and was not selected -> another form or a
+    #: time-shifted channel, and by how much it explained more [nats].
+    beaten: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+
+    def start_state(self, baseline: xr.Dataset) -> State:
+        """Return the state without any effect."""
+        return initial_state(self.state.blocks, baseline, settings=self.state.settings)
+
+    def state_without(self, identification: Selection, baseline: xr.Dataset) -> State:
+        """Return the state with all selections but one in the model, weighted with all of them."""
+        chosen: list[Selection] = [*self.expected, *self.identified, *self.unknown]
+        return replace(
+            condition_on_selections(self.start_state(baseline), chosen, identification),
+            weight=self.state.weight,
+            masked=self.state.masked,
+        )
 
 
 def prepare_examination(

@@ -1,20 +1,17 @@
-"""Define the result of the identification: identified effects, and what is unidentified."""
+"""Define what a selection puts into the model, and the state with selections in the model."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import are_lines, axes_of, sum_evidence
-from gyrostab.diagnose.predict.candidates import Candidate, Component
+from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on_components, refit_weights
-from gyrostab.diagnose.predict.linear_model import State, initial_state
+from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 Array = NDArray[np.float64]
@@ -47,50 +44,6 @@ class Selection:
     def is_named(self) -> bool:
         """Whether it is an effect."""
         return not self.effect.startswith("~")
-
-
-class Rejection(NamedTuple):
-    """An effect that was examined and not named, with the keys of its table in a diagnosis."""
-
-    name: str  # in the registry
-    axes: tuple[str, ...]
-    beaten_by: str  # what explains more: an effect, "noise", or another form in words
-    #: By how much it explains more [nats]; NaN where physics excludes the effect. Below zero, an
-    #: order decides: anomalous samples and real motion come before their consequences.
-    nats: float
-
-
-@dataclass(frozen=True)
-class Identifications:
-    """What the identification found."""
-
-    identified: tuple[Selection, ...]  # the strongest first
-    unknown: tuple[Selection, ...]
-    #: Evidence that noise alone exceeds, in any effect or nuisance alternative, axis and point of
-    #: the grid, with the false-alarm probability [nats].
-    threshold: float
-    null_best: Array  # best evidence in each null record, sorted [nats]
-    reasons: dict[str, str]  # effect -> why this record cannot show it
-    candidates: tuple[Candidate, ...]  # all that were tried
-    state: State  # with all of the above, and the expected effects, in the model
-    count_evidence: CountEvidence = field(default_factory=lambda: CountEvidence({}))
-    #: Effects that the simulation contains as well, with size and time from the recording.
-    expected: tuple[Selection, ...] = ()
-    #: What beats each effect that was examined and not identified.
-    rejected: tuple[Rejection, ...] = ()
-
-    def start_state(self, baseline: xr.Dataset) -> State:
-        """Return the state without any effect."""
-        return initial_state(self.state.blocks, baseline, settings=self.state.settings)
-
-    def state_without(self, identification: Selection, baseline: xr.Dataset) -> State:
-        """Return the state with all selections but one in the model, weighted with all of them."""
-        chosen: list[Selection] = [*self.expected, *self.identified, *self.unknown]
-        return replace(
-            condition_on_selections(self.start_state(baseline), chosen, identification),
-            weight=self.state.weight,
-            masked=self.state.masked,
-        )
 
 
 def components_of(chosen: Iterable[Selection]) -> list[Component]:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from gyrostab.diagnose.identify.components import sum_evidence
-from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identification import Identifications, Selection
+from gyrostab.diagnose.identify.examination import Examination, Identifications
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.windows import channel_units
 from gyrostab.diagnose.reduce.log_blocks import channel_means, is_rms_channel
@@ -34,7 +34,6 @@ Array = NDArray[np.float64]
 
 
 def find_late_channel(
-    examination: Examination,
     identifications: Identifications,
     baseline: xr.Dataset,
     log: xr.Dataset,
@@ -53,14 +52,16 @@ def find_late_channel(
     do not count. Channels that an identified effect follows stay, and those in `moved`. None if
     there is no late channel.
     """
-    settings, blocks = examination.settings, examination.start.blocks
+    examination, blocks = identifications.examination, identifications.state.blocks
     unexplained = [
         selection
         for selection in (*identifications.identified, *identifications.unknown)
         if _may_follow_channel(selection)
     ]
     block_s = float(blocks.attrs["block_s"])
-    reach = min(int(settings.max_delay_s / block_s), blocks.sizes["block"] // _MIN_RECORD_DELAYS)
+    reach = min(
+        int(examination.settings.max_delay_s / block_s), blocks.sizes["block"] // _MIN_RECORD_DELAYS
+    )
     on_time = {name for effect in identifications.identified for name in effect.driver}
     channels = [name for name in channel_units(blocks) if name not in on_time | {*moved}]
     if not unexplained or reach == 0 or not channels:

@@ -15,16 +15,11 @@ from gyrostab.diagnose.identify.components import (
     merge_lines,
     sum_evidence,
 )
-from gyrostab.diagnose.identify.examination import Examination
+from gyrostab.diagnose.identify.examination import Examination, Identifications
 from gyrostab.diagnose.identify.identifiability import keep_physical, passes_time_shift_test
-from gyrostab.diagnose.identify.identification import (
-    Identifications,
-    Selection,
-    add_selection,
-    make_selection,
-)
+from gyrostab.diagnose.identify.identification import Selection, add_selection, make_selection
 from gyrostab.diagnose.identify.naming_order import find_pair, order_passing, order_rivals
-from gyrostab.diagnose.identify.settling import find_rejections, prune_selections, settle_selections
+from gyrostab.diagnose.identify.settling import prune_selections, settle_selections
 from gyrostab.diagnose.identify.withdrawal import withdraw_effects, without_pulses
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
 from gyrostab.diagnose.predict.condition import condition_on
@@ -53,22 +48,14 @@ def identify_effects(examination: Examination) -> Identifications:
     unidentified = [selection for selection in chosen if not selection.is_named]
     remaining, withdrawn = withdraw_effects(examination, identified, unidentified)
     unidentified += withdrawn
-    state = examination.state_with([*remaining, *unidentified])
-    remaining = sorted(remaining, key=lambda identification: -identification.evidence_nats)
-    all_evidence = score_candidates(examination, state, ())
-    components = merge_lines(group_components(all_evidence, settings=examination.settings))
-    rejected = find_rejections(components, remaining, unidentified, beaten, state, examination)
     return Identifications(
-        tuple(remaining),
+        examination,
+        tuple(sorted(remaining, key=lambda identification: -identification.evidence_nats)),
         tuple(unidentified),
-        examination.threshold,
-        examination.null_best,
-        examination.reasons,
+        examination.state_with([*remaining, *unidentified]),
         tuple(examination.candidates),
-        state,
-        examination.count_evidence,
         examination.expected,
-        tuple(rejected),
+        beaten,
     )
 
 
@@ -77,9 +64,8 @@ def _select_all(
 ) -> tuple[list[Selection], dict[str, tuple[str, float]]]:
     """Select the best candidate, put it into the model, and repeat while one passes.
 
-    What wanders without a course comes last, once no other effect passes. The second result has the
-    key of each candidate that passed the threshold and was not selected -> another form or a
-    time-shifted channel, and by how much it explained more [nats].
+    What wanders without a course comes last, once no other effect passes. The second result is
+    `beaten` of `Identifications`.
     """
     chosen: list[Selection] = []
     state = examination.start

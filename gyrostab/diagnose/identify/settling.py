@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
 from gyrostab.diagnose.identify.components import (
     PLAIN_LINE,
-    axes_of,
     candidates_of,
     renew_component,
     split_layers,
     sum_evidence,
 )
-from gyrostab.diagnose.identify.examination import NUISANCE_ALTERNATIVES, Examination
+from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import (
     find_equivalent_effects,
     find_spectral_alternatives,
     keep_physical,
 )
 from gyrostab.diagnose.identify.identification import (
-    Rejection,
     Selection,
     components_of,
     with_axes_of,
@@ -30,8 +27,6 @@ from gyrostab.diagnose.identify.identification import (
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
-
-_NOISE = "noise"
 
 
 def prune_selections(examination: Examination, chosen: list[Selection]) -> list[Selection]:
@@ -92,7 +87,7 @@ def _finish_identification(
     """Return an identification with its evidence and its rivals, all others in the model."""
     state = examination.state_with(chosen, without=identification)
     key = identification.components[0].candidate.key
-    on_axes, weighted = _find_instead(examination, identification, state)
+    on_axes, weighted = find_instead(examination, identification, state)
     layers = _find_layers_again(
         examination, identification.components, on_axes.get(key, []), weighted
     )
@@ -137,11 +132,11 @@ def _finish_identification(
         alternatives=tuple(alternatives),
         components=components,
         # as probable as this effect, whatever their own form explains
-        instead=_sum_by_key(on_axes) | dict.fromkeys(of_any_spectrum, evidence_nats),
+        instead=sum_by_key(on_axes) | dict.fromkeys(of_any_spectrum, evidence_nats),
     )
 
 
-def _find_instead(
+def find_instead(
     examination: Examination, selection: Selection, state: State
 ) -> tuple[dict[str, list[Component]], State]:
     """Return the components of candidates that could take the place of a selection.
@@ -161,7 +156,8 @@ def _find_instead(
     }, weighted
 
 
-def _sum_by_key(components: Mapping[str, Sequence[Component]]) -> dict[str, float]:
+def sum_by_key(components: Mapping[str, Sequence[Component]]) -> dict[str, float]:
+    """Return the evidence of each effect from its components [nats]."""
     return {
         key: sum_evidence(effect_components)
         for key, effect_components in components.items()
@@ -188,92 +184,3 @@ def _find_layers_again(
         layer_components = examination.find_components(candidates_of(layer), state).get(key, [])
         out.append([component for component in layer_components if set(component.row) & axes])
     return out
-
-
-def find_rejections(
-    components: Mapping[str, Sequence[Component]],
-    identified: Sequence[Selection],
-    unidentified: Sequence[Selection],
-    beaten: Mapping[str, tuple[str, float]],
-    state: State,
-    examination: Examination,
-) -> list[Rejection]:
-    """Return for each effect that was not named what beats it, and by how much.
-
-    The noise beats an effect that lacks evidence both with all selections in the model and in
-    place of any of them. A selection beats it if the effect has enough evidence in its place;
-    among several, it is the one in whose place the evidence is largest. If the effect has enough
-    evidence although all selections are in the model, what beat it in the selection does, by key in
-    `beaten`. `components` of every candidate and `state` have all selections in the model.
-    """
-    settled: list[Selection] = [*identified, *unidentified]
-    chosen: list[Selection] = [*identified]
-    for selection in unidentified:
-        without = examination.state_with(settled, without=selection)
-        instead_of_it, _ = _find_instead(examination, selection, without)
-        chosen.append(replace(selection, instead=_sum_by_key(instead_of_it)))
-    named = {
-        selection.effect for selection in (*examination.expected, *chosen) if selection.is_named
-    }
-    out: dict[str, tuple[float, Rejection]] = {}
-    for key, effect_components in components.items():
-        effect = effect_components[0].candidate.effect
-        if key.startswith("~") or effect in named:
-            continue
-        added_nats = sum_evidence(effect_components)
-        required = examination.required_nats(effect_components, chosen)
-        winner = max(
-            chosen, key=lambda selection: selection.instead.get(key, -math.inf), default=None
-        )
-        instead = winner.instead.get(key, -math.inf) if winner else -math.inf
-        if added_nats > required:
-            name, nats = (
-                _find_withdrawn(effect, chosen)
-                or beaten.get(key)
-                or _find_strongest(effect_components, chosen)
-            )
-        elif winner and instead > examination.threshold:
-            name, nats = _name_of(winner), winner.evidence_nats - instead
-        else:
-            name, nats = _NOISE, required - added_nats
-        best = max(added_nats, instead)
-        if effect not in out or best > out[effect][0]:
-            out[effect] = (
-                best,
-                Rejection(effect, axes_of(effect_components, state.axes), name, nats),
-            )
-    return [rejection for _, rejection in out.values()]
-
-
-def _find_withdrawn(effect: str, chosen: Sequence[Selection]) -> tuple[str, float] | None:
-    """Return what is left of an effect that was withdrawn: with it, the noise still changes."""
-    return next(
-        (
-            (_name_of(selection), selection.evidence_nats)
-            for selection in chosen
-            if not selection.is_named and not selection.instead and effect in selection.alternatives
-        ),
-        None,
-    )
-
-
-def _find_strongest(
-    components: Sequence[Component], chosen: Sequence[Selection]
-) -> tuple[str, float]:
-    """Return the strongest selection in the statistics of an effect."""
-    statistics = {component.statistic for component in components}
-    rivals = [
-        selection
-        for selection in chosen
-        if statistics & {component.statistic for component in selection.components}
-    ]
-    strongest = max(rivals, key=lambda selection: selection.evidence_nats, default=None)
-    if strongest is None:
-        return _NOISE, math.nan
-    return _name_of(strongest), strongest.evidence_nats - sum_evidence(components)
-
-
-def _name_of(selection: Selection) -> str:
-    if selection.is_named:
-        return selection.effect
-    return NUISANCE_ALTERNATIVES[selection.effect]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,12 +18,8 @@ from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_expected, fit_ident
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, refer_to_kept_noise, with_noise
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.identify.components import axes_of, sum_evidence
-from gyrostab.diagnose.identify.identification import (
-    Identifications,
-    Rejection,
-    Selection,
-    reduce_selection,
-)
+from gyrostab.diagnose.identify.examination import Identifications
+from gyrostab.diagnose.identify.identification import Selection, reduce_selection
 from gyrostab.diagnose.locate.mismatches import Region
 from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.predict.channel_use import unused_channels
@@ -33,13 +28,17 @@ from gyrostab.diagnose.result.content import SCHEMA, check_diagnosis
 from gyrostab.diagnose.result.diagnosis import Diagnosis, plain
 from gyrostab.diagnose.result.held_out import measure_evidence
 from gyrostab.diagnose.result.mismatch_tables import mismatch_tables
+from gyrostab.diagnose.result.rejections import (
+    find_rejections,
+    find_unsupported,
+    rejected_tables,
+)
 from gyrostab.diagnose.result.surfaces import make_surfaces
 from gyrostab.diagnose.result.tables import (
     baseline_table,
     effect_tables,
     model_tables,
     recording_table,
-    rejected_tables,
 )
 from gyrostab.diagnose.result.verdict import decide_verdict
 from gyrostab.diagnose.task import NamedBlocks, Task, lines_without_motion
@@ -88,7 +87,12 @@ def finish_diagnosis(
         "effects": effects,
         "unexplained": unexplained,
         "not_found": find_upper_limits(fit.identifications),
-        "rejected": rejected_tables(fit.identifications),
+        "rejected": rejected_tables(
+            [
+                *find_rejections(named.identifications),
+                *find_unsupported(named.identifications.identified, fit.identifications.identified),
+            ]
+        ),
         "unused_channels": unused_channels(blocks, used),
         "channel_delays": [
             {"name": name, "delay_s": delay_s}
@@ -222,7 +226,6 @@ def keep_supported(
     """
     identified: list[Selection] = []
     unknown: list[Selection] = []
-    rejected: list[Rejection] = []
     for identification, numbers in zip(identifications.identified, fitted, strict=True):
         good = {axis for fitted_effect in numbers for axis in supported_axes(fitted_effect)}
         if set(identification.axes) <= good or not numbers:
@@ -236,9 +239,6 @@ def keep_supported(
             identified.append(reduce_selection(identification, supported, evidence_nats))
         else:
             supported = []
-            rejected.append(
-                Rejection(identification.effect, identification.axes, "a size of zero", math.nan)
-            )
         lost = tuple(
             component for component in identification.components if component not in supported
         )
@@ -261,5 +261,4 @@ def keep_supported(
         identifications,
         identified=tuple(identified),
         unknown=(*identifications.unknown, *unknown),
-        rejected=(*identifications.rejected, *rejected),
     )

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.identify.examination import NUISANCE_ALTERNATIVES
-from gyrostab.diagnose.identify.identification import Identifications, Selection, components_of
+from gyrostab.diagnose.identify.examination import NUISANCE_ALTERNATIVES, Identifications
+from gyrostab.diagnose.identify.identification import Selection, components_of
 from gyrostab.diagnose.locate.mismatches import Region
 from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
 from gyrostab.diagnose.reduce.block_statistics import iso, measured
@@ -91,7 +91,7 @@ def identified_mismatches(
     out: list[dict[str, Any]] = []
     begin, end = blocks["begin"].values, blocks["end"].values
     settings = identifications.state.settings
-    null = fit_best_evidence(identifications.null_best, settings=settings)
+    null = fit_best_evidence(identifications.examination.null_best, settings=settings)
     for identification in identifications.identified:
         if any(
             identification.effect in region["explained_by"]
@@ -120,7 +120,9 @@ def unidentified_mismatches(
     out: list[dict[str, Any]] = []
     rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
     longest = float(blocks["end"].values[-1]) / 2.0
-    null = fit_best_evidence(identifications.null_best, settings=identifications.state.settings)
+    null = fit_best_evidence(
+        identifications.examination.null_best, settings=identifications.state.settings
+    )
     for unidentified in identifications.unknown:
         view = unidentified.components[0].statistic.view
         if any(

@@ -18,7 +18,6 @@ from gyrostab.diagnose.estimate.constant_rate import (
 )
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.components import are_lines
-from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.predict.windows import channel_units, make_windows
 from gyrostab.diagnose.reduce.block_statistics import iso
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
@@ -165,16 +164,6 @@ def _families_of(fitted: Sequence[Fitted], blocks: xr.Dataset) -> list[str | Non
         for number, family in zip(lines, labels, strict=True):
             families[number] = family
     return families
-
-
-def rejected_tables(identifications: Identifications) -> list[dict[str, Any]]:
-    """Return what beats each effect that was examined and not named, the closest first."""
-    named = {identification.effect for identification in identifications.identified}
-    closest_first = sorted(
-        identifications.rejected,
-        key=lambda rejection: (math.isnan(rejection.nats), rejection.nats, rejection.name),
-    )
-    return [rejection._asdict() for rejection in closest_first if rejection.name not in named]
 
 
 def model_tables(

@@ -111,9 +111,9 @@ def test_only_a_rounded_rate_is_named(kind: str, names: list[str]) -> None:
     baseline, records = nulls(blocks, 40)
     identifications = name_effects(blocks, baseline, records)
     assert [identification.effect for identification in identifications.identified] == names
-    assert ("quantization grid" in identifications.reasons.get("rate_quantization", "")) == (
-        kind == "angle"
-    )
+    assert (
+        "quantization grid" in identifications.examination.reasons.get("rate_quantization", "")
+    ) == (kind == "angle")
 
 
 def cut_record(

@@ -10,8 +10,8 @@ from scipy.signal import lfilter
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.evidence.telegraph import telegraph_courses, telegraph_evidence
+from gyrostab.diagnose.identify.examination import Identifications
 from gyrostab.diagnose.identify.identifiability import keep_physical
-from gyrostab.diagnose.identify.identification import Identifications
 from gyrostab.diagnose.identify.naming_order import put_followers_first
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import State

@@ -12,7 +12,8 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.identify.identification import Identifications, Selection
+from gyrostab.diagnose.identify.examination import Identifications
+from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import drop_changed_tails
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -138,7 +139,8 @@ def identifications(
     )
     null = np.sort(np.random.default_rng(1).exponential(1.0, 400))
     state: Any = SimpleNamespace(settings=DEFAULTS)
-    return Identifications((identification,), (), 7.0, null, {}, (), state)
+    examination: Any = SimpleNamespace(null_best=null)
+    return Identifications(examination, (identification,), (), state, ())
 
 
 def blocks() -> xr.Dataset:

@@ -12,8 +12,7 @@ import xarray as xr
 
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify import late_channels
-from gyrostab.diagnose.identify.examination import Examination, prepare_examination
-from gyrostab.diagnose.identify.identification import Identifications
+from gyrostab.diagnose.identify.examination import Identifications, prepare_examination
 from gyrostab.diagnose.identify.late_channels import (
     Array,
     DelaySearch,
@@ -66,11 +65,10 @@ def recorded(
     )
 
 
-def examined(log: xr.Dataset) -> tuple[Examination, Identifications, xr.Dataset, xr.Dataset]:
+def examined(log: xr.Dataset) -> tuple[Identifications, xr.Dataset, xr.Dataset]:
     blocks = reduce_log(log, block="10s")
     baseline, records = nulls(blocks)
-    examination = prepare_examination(blocks, baseline, records)
-    return examination, identify_effects(examination), baseline, log
+    return identify_effects(prepare_examination(blocks, baseline, records)), baseline, log
 
 
 @pytest.mark.slow
@@ -149,18 +147,22 @@ def test_late_channel_explains_more_than_all_else(
     blocks = xr.Dataset({"channel_vibration": ("block", np.zeros(90))}, attrs={"block_s": 10.0})
     examination: Any = SimpleNamespace(
         settings=DEFAULTS,
-        start=SimpleNamespace(blocks=blocks),
         threshold=9.0,
         state_with=lambda selections: None,
     )
     unexplained = SimpleNamespace(driver=(), components=(), evidence_nats=without_channel)
-    identifications: Any = SimpleNamespace(identified=(), unknown=(unexplained,))
+    identifications: Any = SimpleNamespace(
+        examination=examination,
+        identified=(),
+        unknown=(unexplained,),
+        state=SimpleNamespace(blocks=blocks),
+    )
     monkeypatch.setattr(late_channels, "DelaySearch", GivenEvidence)
-    found = find_late_channel(examination, identifications, blocks, blocks)
+    found = find_late_channel(identifications, blocks, blocks)
     assert found == (("vibration", 30.0) if is_late else None)
     # another effect follows the channel at its own time
     identifications.identified = (SimpleNamespace(driver=("vibration",), components=()),)
-    assert find_late_channel(examination, identifications, blocks, blocks) is None
+    assert find_late_channel(identifications, blocks, blocks) is None
 
 
 @pytest.mark.slow

@@ -29,6 +29,7 @@ from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.search import combine_rows, compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.result.rejections import find_rejections
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
@@ -54,8 +55,8 @@ def shaken():
 def test_noise_has_no_identification():
     identifications = identify([], axes="xy", seed=2)
     assert identifications.identified == identifications.unknown == ()
-    assert 3.0 < identifications.threshold < 15.0
-    assert identifications.null_best.size == 40
+    assert 3.0 < identifications.examination.threshold < 15.0
+    assert identifications.examination.null_best.size == 40
 
 
 @pytest.mark.slow
@@ -89,17 +90,17 @@ def test_vibration_noise_is_identified_on_its_axis(shaken):
     assert identification.effect == "vibration_noise"
     assert identification.axes == ("x",)
     assert identification.driver == ("vibration",)
-    assert identification.evidence_nats > identification.threshold >= shaken.threshold
+    assert identification.evidence_nats > identification.threshold >= shaken.examination.threshold
     assert "temperature_noise" not in identification.alternatives
     assert not shaken.unknown
 
 
 def test_every_other_effect_is_rejected_for_a_competitor(shaken):
-    rejected = {rejection.name: rejection for rejection in shaken.rejected}
+    rejected = {rejection.name: rejection for rejection in find_rejections(shaken)}
     assert "vibration_noise" not in rejected
     noise = rejected["temperature_bias"]
     assert noise.beaten_by == "noise"
-    assert 0.0 < noise.nats < shaken.threshold + 2.0
+    assert 0.0 < noise.nats < shaken.examination.threshold + 2.0
     # the same noise, of vibration beyond half the sampling rate: its alternative, of equal evidence
     assert rejected["aliased_vibration"].beaten_by == "vibration_noise"
     assert abs(rejected["aliased_vibration"].nats) < 3.0

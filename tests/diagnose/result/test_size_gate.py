@@ -151,7 +151,8 @@ def test_effect_of_possibly_zero_size_becomes_unidentified():
     identifications = identify_by_hand(
         blocks, baseline, "vibration_rectification", "mean", ("sensitivity",)
     )
-    identifications = replace(identifications, null_best=np.arange(8.0))
+    examination = replace(identifications.examination, null_best=np.arange(8.0))
+    identifications = replace(identifications, examination=examination)
     supported, first, fit = conclude.fit_supported(identifications, baseline)
     assert (supported.identified, first, fit.fitted) == ((), [], [])
     assert effect_tables(fit.fitted, blocks) == []

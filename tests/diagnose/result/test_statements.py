@@ -147,7 +147,10 @@ def test_coarse_angle_counter_is_recognised(seed: int) -> None:
     rates = np.diff(np.floor(angle), axis=1)
     blocks = reduce_log(make_log(rates, rate=RATE, unit="deg/h"))
     baseline, records = nulls(blocks, 10)
-    assert name_effects(blocks, baseline, records).reasons["rate_quantization"] == COARSE_ANGLE_GRID
+    assert (
+        name_effects(blocks, baseline, records).examination.reasons["rate_quantization"]
+        == COARSE_ANGLE_GRID
+    )
 
 
 def test_tool_face_is_said_to_come_from_the_rotation_rate() -> None:
