@@ -255,15 +255,19 @@ def find_spectral_alternatives(
     state: State,
     examination: Examination,
 ) -> list[str]:
-    """Return effects of the same channel, if a spectrum of another form explains clearly more.
+    """Return effects of the same channel, if the spectrum does not tell them apart.
 
-    The forms that were tried then do not tell the effects apart: vibration through the resonance of
-    a mount has a hump like an aliased band. `state` has all other effects in the model.
+    Vibration through the resonance of a mount has a hump like an aliased band. The same holds for
+    any spectrum that explains clearly more than the forms that were tried. `state` has all other
+    effects in the model.
     """
     powers = [component for component in components if component.statistic.is_power]
     others = list(effects()[effect].look_alikes("any spectrum"))
     if not others or not powers:
         return []
+    for part in powers:
+        if all(variant.values.get("resonance") for variant in (part.variant, *part.close)):
+            return others
     own_nats = sum(component.evidence_nats for component in powers)
     free = 0.0
     for component in powers:
