@@ -59,8 +59,8 @@ class Settings:
     ambiguous_nats: float = _make_setting(
         3.0,
         "nat",
-        "Difference of evidence within which two effects are alternatives, and by which another "
-        "form must be better than a jump or two levels.",
+        "Difference of evidence within which two effects are alternatives, beyond what an error of "
+        "form costs, and by which another form must be better than a jump or two levels.",
         "odds of 20 to 1, ln 20 = 3.0 (strong evidence: Kass and Raftery, 1995, "
         "doi:10.1080/01621459.1995.10476572)",
     )

@@ -165,6 +165,26 @@ def make_selection(
     )
 
 
+def own_form_error(
+    components: Sequence[Component], evidence_nats: float, *, settings: Settings = DEFAULTS
+) -> float:
+    """Return what an error of its form may cost an effect with this evidence [nats].
+
+    The evidence of a size grows with its square, and so does what an error of its form costs. That
+    of a random walk has no such error: another walk that explains more is another one.
+    """
+    has_size = all(component.statistic.has_size for component in components)
+    return settings.form_error_share * max(evidence_nats, 0.0) * has_size
+
+
+def ambiguous_evidence(
+    components: Sequence[Component], evidence_nats: float, *, settings: Settings = DEFAULTS
+) -> float:
+    """Return the least evidence of an alternative to an effect with this evidence [nats]."""
+    error = own_form_error(components, evidence_nats, settings=settings)
+    return evidence_nats - settings.ambiguous_nats - error
+
+
 def form_error(
     components: Sequence[Component],
     chosen: Sequence[Selection],

@@ -10,11 +10,14 @@ import numpy as np
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, keep_physical
-from gyrostab.diagnose.identify.identification import form_error, make_selection
+from gyrostab.diagnose.identify.identification import (
+    ambiguous_evidence,
+    form_error,
+    make_selection,
+)
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on, mean_columns
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.statistics.spectral_line import explained_lines
 
 
 def order_passing(
@@ -49,15 +52,7 @@ def order_passing(
         counts
         or confirmed
         or switching
-        or _on_other_axes(
-            _without_slopes(
-                _without_locked_lines(passing, components, state),
-                components,
-                state,
-                examination,
-            ),
-            components,
-        )
+        or _on_other_axes(_without_slopes(passing, components, state, examination), components)
     )
     return put_followers_first(first, components, state)
 
@@ -89,18 +84,16 @@ def order_rivals(
     state: State,
     examination: Examination,
 ) -> list[str]:
-    """Return the effects that come close to the best, plainer ones first.
-
-    The evidence of a size grows with its square, and so does what an error of its form costs. That
-    of a random walk has no such error: another walk that explains more is another one.
-    """
+    """Return the effects that come close to the best, plainer ones first."""
     settings = examination.settings
     best = sum_evidence(components[passing[0]])
-    rivals = []
-    for key in passing:
-        error = settings.form_error_share * best * components[key][0].statistic.has_size
-        if sum_evidence(components[key]) >= best - settings.ambiguous_nats - error:
-            rivals += [] if key.startswith("~") else [key]
+    rivals = [
+        key
+        for key in passing
+        if not key.startswith("~")
+        and sum_evidence(components[key])
+        >= ambiguous_evidence(components[key][:1], best, settings=settings)
+    ]
     effects = {components[key][0].candidate.effect for key in rivals}
     is_later = {
         key: _is_on_single_axis(components[key], examination.candidates)
@@ -111,32 +104,6 @@ def order_rivals(
         rivals,
         key=lambda key: settings.ambiguous_nats * is_later[key] - sum_evidence(components[key]),
     )
-
-
-def _without_locked_lines(
-    passing: list[str], components: Mapping[str, list[Component]], state: State
-) -> list[str]:
-    """Drop lines that a passing phase-locked effect explains on all of their axes."""
-    locked = [
-        key
-        for key in passing
-        if any(component.statistic.is_phase_locked for component in components[key])
-    ]
-    lines = [key for key in passing if components[key][0].candidate.statistic.is_line]
-    if not lines:
-        return passing
-    explained = np.zeros((len(state.axes), state.blocks.sizes["line"]), np.bool_)
-    for key in locked:
-        explained |= explained_lines(condition_on(state, components[key]))
-    return [
-        key
-        for key in passing
-        if key not in lines
-        or not all(
-            explained[state.axes.index(component.row[0]), component.place]
-            for component in components[key]
-        )
-    ]
 
 
 def _without_slopes(
@@ -157,21 +124,12 @@ def _without_slopes(
     if not lines or not filters:
         return passing
     trial = condition_on(state, list(components[filters[0]]))
-    line_evidence = examination.compute_evidence(
-        [components[key][0].candidate for key in lines], trial
-    )
-    nats_after = {
-        evidence.candidate.key: float(np.maximum(evidence.evidence_nats[0], 0.0).sum())
-        for evidence in line_evidence
-    }
-    nats_before = {
-        key: sum(max(component.evidence_nats, 0.0) for component in components[key])
-        for key in lines
-    }
+    after = examination.find_components([components[key][0].candidate for key in lines], trial)
     real = {
         key
         for key in lines
-        if nats_after.get(key, 0.0) > state.settings.majority_share * nats_before[key]
+        if sum_evidence(after.get(key, []))
+        > state.settings.majority_share * sum_evidence(components[key])
     }
     if not real:
         return [key for key in passing if key not in lines]

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from gyrostab.diagnose.identify.components import (
     PLAIN_LINE,
     are_lines,
@@ -17,13 +15,19 @@ from gyrostab.diagnose.identify.components import (
 )
 from gyrostab.diagnose.identify.examination import Examination, Identifications
 from gyrostab.diagnose.identify.identifiability import keep_physical, passes_time_shift_test
-from gyrostab.diagnose.identify.identification import Selection, add_selection, make_selection
+from gyrostab.diagnose.identify.identification import (
+    Selection,
+    add_selection,
+    ambiguous_evidence,
+    make_selection,
+)
 from gyrostab.diagnose.identify.naming_order import find_pair, order_passing, order_rivals
 from gyrostab.diagnose.identify.settling import prune_selections, settle_selections
 from gyrostab.diagnose.identify.withdrawal import withdraw_effects, without_pulses
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
+from gyrostab.diagnose.predict.search import combine_rows
 from gyrostab.physics.base import Effect
 
 # Limits of the time of a search; a record has fewer effects.
@@ -43,8 +47,8 @@ def identify_effects(examination: Examination) -> Identifications:
     """
     examination = identify_expected_effects(examination)
     selected, beaten = _select_all(examination)
-    chosen = without_pulses(selected, examination.settings)
-    chosen, identified = settle_selections(examination, prune_selections(examination, chosen))
+    chosen, identified = settle_selections(examination, prune_selections(examination, selected))
+    identified = without_pulses(identified, examination.settings)
     unidentified = [selection for selection in chosen if not selection.is_named]
     remaining, withdrawn = withdraw_effects(examination, identified, unidentified)
     unidentified += withdrawn
@@ -153,8 +157,8 @@ def score_candidates(
     min_nats = settings.reweight_thresholds * examination.threshold
     for _ in range(2):
         powers = [evidence for evidence in all_evidence if evidence.candidate.statistic.is_power]
-        strongest = max(powers, key=_positive_evidence, default=None)
-        if strongest is None or _positive_evidence(strongest) < min_nats:
+        strongest = max(powers, key=_sum_rows, default=None)
+        if strongest is None or _sum_rows(strongest) < min_nats:
             break
         trial = condition_on(state, find_components(strongest, settings=settings))
         weighted_evidence = examination.compute_evidence(
@@ -215,7 +219,8 @@ def _select_next(
         if shifted:
             failed |= shifted
             continue
-        min_nats = sum_evidence(option[0][1]) - settings.ambiguous_nats
+        best = option[0][1]
+        min_nats = ambiguous_evidence(best, sum_evidence(best), settings=settings)
         close = [
             components[other][0].candidate.effect
             for other in rivals
@@ -243,8 +248,8 @@ def _find_shifted(
     return None if passed else ("a time-shifted channel", nats)
 
 
-def _positive_evidence(evidence: CandidateEvidence) -> float:
-    return float(np.maximum(evidence.evidence_nats[0], 0.0).sum())
+def _sum_rows(evidence: CandidateEvidence) -> float:
+    return float(combine_rows(evidence.evidence_nats[0]))
 
 
 def identify_expected_effects(examination: Examination) -> Examination:

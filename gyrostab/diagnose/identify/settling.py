@@ -21,6 +21,7 @@ from gyrostab.diagnose.identify.identifiability import (
 )
 from gyrostab.diagnose.identify.identification import (
     Selection,
+    ambiguous_evidence,
     components_of,
     with_axes_of,
 )
@@ -30,11 +31,9 @@ from gyrostab.diagnose.predict.linear_model import State
 
 
 def prune_selections(examination: Examination, chosen: list[Selection]) -> list[Selection]:
-    """Drop what fails the threshold with the others in the model, the weakest first.
+    """Drop what is unidentified and fails the threshold with the others in the model.
 
-    Unidentified ones are tested before identifications, and these lose the axes that no longer
-    show them. The first selection stays, unless it is of anomalous samples, which come first
-    whatever their evidence.
+    The weakest is tested first. Then identifications lose the axes that no longer show them.
     """
     for selection in sorted(
         chosen,
@@ -45,17 +44,12 @@ def prune_selections(examination: Examination, chosen: list[Selection]) -> list[
         components_by_key = examination.find_components(
             candidates_of(selection.components), examination.state_with(chosen, without=selection)
         )
-        is_leading = (
-            selection is chosen[0]
-            and selection.is_named
-            and not selection.components[0].statistic.is_count
-        )
         best = max(map(sum_evidence, components_by_key.values()), default=0.0)
-        if not is_leading and best < examination.threshold:
-            chosen = [other for other in chosen if other is not selection]
-        elif selection.is_named:
+        if selection.is_named:
             reduced = with_axes_of(selection, components_by_key, settings=examination.settings)
             chosen = [reduced if other is selection else other for other in chosen]
+        elif best < examination.threshold:
+            chosen = [other for other in chosen if other is not selection]
     return chosen
 
 
@@ -92,7 +86,9 @@ def _finish_identification(
         examination, identification.components, on_axes.get(key, []), weighted
     )
     evidence_nats = sum(max(sum_evidence(layer), 0.0) for layer in layers)
-    min_nats = evidence_nats - examination.settings.ambiguous_nats
+    min_nats = ambiguous_evidence(
+        identification.components, evidence_nats, settings=examination.settings
+    )
     rivals = [
         components[0].candidate.effect
         for other, components in on_axes.items()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
-from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.identify.identification import Selection, own_form_error
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 
@@ -77,7 +77,9 @@ def name_probability(identification: Selection, *, settings: Settings = DEFAULTS
     With the evidence :math:`E` of the effect [nats], and :math:`E_k` of its alternatives in its
     place, it is :math:`p / (1 + w \sum_k \exp(E_k - E))`: p is the probability that one of them is
     right, and w the weight of an alternative of equal evidence. An alternative that predicts the
-    same data has the same evidence. `benchmarks/name_probability.py` fits p and w to blind tests.
+    same data has the same evidence; so has one whose evidence differs by less than what an error of
+    its form may cost the effect, and that of others differs by so much less.
+    `benchmarks/name_probability.py` fits p and w to blind tests.
 
     Examples
     --------
@@ -93,9 +95,12 @@ def name_probability(identification: Selection, *, settings: Settings = DEFAULTS
         )
         for name in identification.alternatives
     ]
+    error = own_form_error(identification.components, evidence_nats, settings=settings)
+    ahead_nats = np.array(other_nats) - evidence_nats
+    ahead_nats -= np.clip(ahead_nats, -error, error)
     # E_k - E may be any number of nats.
     weights = [1.0, *[settings.alternative_weight] * len(other_nats)]
-    share = np.exp(evidence_nats - logsumexp([evidence_nats, *other_nats], b=weights))
+    share = np.exp(-logsumexp([0.0, *ahead_nats], b=weights))
     return float(settings.set_probability * share)
 
 

@@ -30,13 +30,24 @@ def test_an_alternative_takes_its_share():
 
 def test_evidence_against_an_alternative_raises_the_probability():
     probabilities = [
-        probability("warm_up", warm_up=nats) for nats in (22.0, 20.0, 19.0, 17.0, 10.0)
+        probability("warm_up", warm_up=nats) for nats in (22.2, 20.0, 19.0, 17.0, 10.0)
     ]
     assert probabilities == sorted(probabilities)
     assert probabilities[-1] == pytest.approx(0.9, abs=1e-4)
-    # a plainer effect may be named although another has more evidence
+    # a plainer effect may be named although another has more evidence; the form costs up to 0.2
     assert probabilities[0] == pytest.approx(0.9 / (1.0 + 0.5 * np.exp(2.0)))
     assert probability("rate_quantization", rate_quantization=7e5) == 0.0
+
+
+def test_differences_that_the_form_of_the_effect_may_cost_do_not_count():
+    for nats in (1995.0, 1980.0, 2020.0):
+        strong = replace(ALONE, evidence_nats=2000.0, alternatives=("warm_up",))
+        strong = replace(strong, instead={"warm_up": nats})
+        assert name_probability(strong, settings=SETTINGS) == pytest.approx(0.6)
+    weaker = replace(strong, instead={"warm_up": 1979.0})
+    assert name_probability(weaker, settings=SETTINGS) == pytest.approx(
+        0.9 / (1.0 + 0.5 * np.exp(-1.0))
+    )
 
 
 def test_the_channel_with_most_evidence_counts():
