@@ -15,6 +15,8 @@ from gyrostab.units import HOUR, INNER
 
 _MINUTE = 60.0
 _NO_LAG_S = 1e-3
+#: Lags of a temperature sensor that a diagnosis tries [s]: none, in a pocket, on the housing.
+_SENSOR_LAGS_S = np.array([0.0, 20.0, 60.0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,6 +24,9 @@ class TemperatureBias(Effect):
     """Bias that follows the temperature without delay.
 
     ``b = a1 (T - T0) + a2 (T - T0)^2 + a3 (T - T0)^3``
+
+    With a sensor that lags the gyro by ``sensor_lag``, T is the channel plus ``sensor_lag`` times
+    its rate of change.
 
     References
     ----------
@@ -55,19 +60,40 @@ class TemperatureBias(Effect):
     reference: float = parameter(
         "degC", "temperature at which the bias is zero", default=25.0, low=-273.15, high=500.0
     )
+    sensor_lag: float = parameter(
+        "s", "lag of the temperature sensor behind the gyro", default=0.0, low=0.0, high=HOUR
+    )
+
+    def courses(self) -> tuple[str, ...]:
+        """List the temperature if its sensor lags: its change would be that of the noise."""
+        return self.needs() if self.sensor_lag else ()
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        above = chunk.drivers["temperature"] - self.reference
+        temperature = chunk.drivers["temperature"]
+        above = temperature - self.reference
+        if self.sensor_lag and chunk.size:
+            previous = float(temperature[0]) if state is None else state
+            above = above + self.sensor_lag * np.diff(temperature, prepend=previous) * chunk.rate
+            state = float(temperature[-1])
         return above * (self.sensitivity + above * (self.quadratic + above * self.cubic)), state
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+        return {"sensor_lag": _SENSOR_LAGS_S}
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict window means proportional to powers of the temperature."""
         above = windows.drivers["temperature"] - self.reference
+        if self.sensor_lag:
+            at, temperature = windows.course("temperature")
+            change = _average_changes(windows, at, temperature, _NO_LAG_S)
+            above = above + self.sensor_lag / _MINUTE * change
         return Prediction(mean={"sensitivity": above, "quadratic": above**2, "cubic": above**3})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         terms = [self.quantity(name, errors) for name in self.list_sizes() or ("sensitivity",)]
         size = f"{', '.join(terms)} around {self.quantity('reference')}"
+        if self.sensor_lag:
+            size += f", measured by a sensor that lags by {self.quantity('sensor_lag', errors)}"
         return f"The bias follows the temperature {self.on_axes()}, by {size}."
 
 
@@ -176,7 +202,7 @@ class Shupe(Effect):
         """List lags from none to thick windings, with sensors on the winding and off it."""
         return {
             "lag": np.append(_NO_LAG_S, np.geomspace(30.0, 3000.0, 6)),
-            "sensor_lag": np.array([0.0, 20.0, 60.0]),
+            "sensor_lag": _SENSOR_LAGS_S,
         }
 
     def explain(self, windows: Windows) -> Prediction:

@@ -122,6 +122,21 @@ def test_lagged_temperature_bias_equals_two_effects():
         np.testing.assert_allclose(bias, a * (late - 20.0), atol=1e-3 * a * 7.0)
 
 
+@pytest.mark.parametrize("cuts", [(), (1, 1000, 3001)])
+def test_bias_behind_a_lagging_sensor_is_that_of_the_true_temperature(cuts):
+    """A sensor with a lag of 40 s sees a ramp that ends after 300 s."""
+    rate, late, v = 10.0, 40.0, 2.0
+    t = np.arange(6000) / rate
+    true = 20.0 + v / 60.0 * np.minimum(t, 300.0)
+    after = np.maximum(t - 300.0, 0.0)
+    reading = true - v / 60.0 * late * (np.exp(-after / late) - np.exp(-t / late))
+    table = {"name": "temperature_bias", "sensitivity": 0.02, "quadratic": 0.001}
+    effect = make_effect(table | {"reference": 20.0, "sensor_lag": late})
+    expected = 0.02 * (true - 20.0) + 0.001 * (true - 20.0) ** 2
+    bias = run(effect, size=t.size, rate=rate, drivers={"temperature": reading}, cuts=cuts)[0]
+    np.testing.assert_allclose(bias, expected, atol=2e-3 * expected.max())
+
+
 def test_sensor_lag_is_corrected_on_a_ramp():
     """A sensor with a lag of 40 s sees a ramp; one mode follows the true ramp."""
     rate, lag, late, v = 10.0, 60.0, 40.0, 2.0

@@ -57,6 +57,7 @@ def generated(effect, **noise):
     "table",
     [
         {"name": "temperature_bias", "sensitivity": 1.0},
+        {"name": "temperature_bias", "sensitivity": 1.0, "sensor_lag": 40},
         {"name": "shupe", "sensitivity": 1.0},
         {"name": "shupe", "sensitivity": 0.0, "transient": 1.0},
         {"name": "shupe", "sensitivity": 1.0, "modes": 1, "lag": 1000},
