@@ -88,14 +88,13 @@ def baseline_from_model(
     squares = np.stack([posterior.square for posterior in posteriors])
     effects = expect_known_effects(blocks, parsed, squares)
     attrs["left_out"] = effects.left_out
-    hours = (blocks["begin"].values + blocks["end"].values) / (2.0 * HOUR)
     ramp = np.array([parsed.coefficients(axis)["R"] for axis in axes])
     out = assemble_baseline(
         blocks,
         posteriors,
         quiet=chosen,
         attrs=attrs,
-        known_mean=effects.mean + ramp[:, None] * hours,
+        known_mean=effects.mean + expect_ramp(blocks, ramp),
         spectrum=effects.spectrum,
         settings=settings,
     )
@@ -106,6 +105,12 @@ def baseline_from_model(
     out["coefficient"].loc[{"term": "R"}] = ramp
     out["stderr"].loc[{"term": list(TERMS) if given_blocks is None else ["R"]}] = 0.0
     return out
+
+
+def expect_ramp(blocks: xr.Dataset, ramp: Array) -> Array:
+    """Return what the ramp R t [degree hour-2] of each axis adds to its block means."""
+    hours = (blocks["begin"].values + blocks["end"].values) / (2.0 * HOUR)
+    return np.asarray(ramp[:, None] * hours)
 
 
 def _describe_lines(baseline: xr.Dataset, blocks: xr.Dataset, square: Array) -> None:

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, PassedNoise, undo_transfer
-from gyrostab.diagnose.baseline.from_model import fit_noise_factor
+from gyrostab.diagnose.baseline.from_model import expect_ramp, fit_noise_factor
 from gyrostab.diagnose.baseline.known_effects import expect_known_effects
 from gyrostab.diagnose.predict.windows import predict_effect
 from gyrostab.diagnose.reduce.schema import weighted_mean
@@ -24,17 +24,21 @@ _MIN_GAIN = 0.05  # of slow changes; with less, the record does not show them
 
 
 def constant_rates(
-    blocks: xr.Dataset, effects: Sequence[Effect], turning: str = ""
+    blocks: xr.Dataset,
+    effects: Sequence[Effect],
+    turning: str = "",
+    ramp: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
     """Return the rate that a simulation adds on each axis to have the mean of the recording.
 
     Where values are rounded, clipped or stuck at zero depends on the constant rate, which the
     comparison leaves free otherwise. It is by axis [degree hour-1], and 0 without a block mean.
     `effects` are all of the model, with their sizes; `turning` is the axis that feels the channel
-    ``rotation_rate``, if any.
+    ``rotation_rate``, if any; `ramp` is R of the axes [degree hour-2].
     """
     axes = tuple(str(axis) for axis in blocks["axis"].values)
-    rate = blocks["mean"].values.copy()
+    slopes = np.array([(ramp or {}).get(axis, 0.0) for axis in axes])
+    rate = blocks["mean"].values - expect_ramp(blocks, slopes)
     changed = _changed_rows(axes, effects)
     for effect in effects:
         if any(effect is other for _, other in changed):

@@ -205,7 +205,8 @@ def model_tables(
     log = {"log": {"oversampling": instrument}} if instrument > 1 else {}
     band = own.flicker_band if own is not None else Model.flicker_band
     flicker = {"flicker_band": list(band)} if band != Model.flicker_band else {}
-    rates = constant_rates(blocks, [*given_effects, *added_effects], turning)
+    ramp = {axis: terms["R"] for axis, terms in noise.items()}
+    rates = constant_rates(blocks, [*given_effects, *added_effects], turning, ramp)
     tables: dict[str, Any] = {
         **log,
         "noise": {**flicker, **noise},
