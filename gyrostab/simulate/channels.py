@@ -18,6 +18,8 @@ from gyrostab.time.stamps import stamp_ns
 from gyrostab.units import INNER, parse_unit
 
 Array = NDArray[np.float64]
+#: Longest log [s].
+MAX_DURATION_S = 1e9
 #: Table of a profile: rows of a time [s] and what holds there.
 Points = Sequence[Sequence[float]]
 #: Attribute of a channel whose values hold until the next one instead of running towards it.

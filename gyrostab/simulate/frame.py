@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.registry import is_number
 from gyrostab.schema import GAP_CAUSES, log_channels
-from gyrostab.simulate.channels import combine, convert_units
+from gyrostab.simulate.channels import MAX_DURATION_S, combine, convert_units
 from gyrostab.simulate.model import PROFILES, Model
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import (
@@ -83,10 +83,10 @@ def make_frame(
         raise OptionError(
             f"{model.source}: rate {hertz!r} is not a number of Hz above 0 and up to 1e6"
         )
-    if isinstance(length, bool) or duration_seconds(length, "duration") > 1e9:
+    if isinstance(length, bool) or duration_seconds(length, "duration") > MAX_DURATION_S:
         raise OptionError(
             f"{model.source}: the duration {length} is not valid; "
-            "give for instance 1h, at most 1e9 s"
+            f"give for instance 1h, at most {MAX_DURATION_S:g} s"
         )
     size = round(duration_seconds(length, "duration") * hertz)
     if size < 1:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gyrostab.errors import OptionError
 from gyrostab.ingest.gap_table import gap_variables
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.simulate.channels import Points, check_points
+from gyrostab.simulate.channels import MAX_DURATION_S, Points, check_points
 from gyrostab.simulate.noise import stream
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.stamps import stamp_ns
@@ -20,33 +20,34 @@ from gyrostab.units import HOUR
 _MISSING, _RESTART = (GAP_CAUSES.index(name) for name in ("missing", "restart"))
 
 
-def _make_table(spans: NDArray[np.float64], cause: int, start: Any) -> xr.Dataset:
-    """Make gaps from seconds; they are cut to samples when the log is made."""
-    edges = np.rint(spans.reshape(-1, 2) * 1e9).astype(np.int64)
+def _make_table(spans: NDArray[np.float64], cause: int, duration: Any, start: Any) -> xr.Dataset:
+    """Make gaps from seconds within the log; they are cut to samples when the log is made."""
+    inside = np.clip(spans.reshape(-1, 2), 0.0, duration_seconds(duration, "duration"))
+    edges = np.rint(inside * 1e9).astype(np.int64)
     unknown = np.zeros((len(edges), 2), np.int64)  # samples and rows
     table = np.column_stack([edges, unknown, np.full(len(edges), cause)])
     variables = gap_variables(table, stamp_ns(start), rate=1e9)
     return xr.Dataset({name: variables[name] for name in ("gap_start", "gap_end", "gap_cause")})
 
 
-def gaps(spans: Points, *, duration: Any = None, start: Any = "1970-01-01") -> xr.Dataset:
+def gaps(spans: Points, *, duration: Any = MAX_DURATION_S, start: Any = "1970-01-01") -> xr.Dataset:
     """Make gaps at given times.
 
     Parameters
     ----------
     spans : list of (from, to)
         First missing instant and first one there again [s]; Wang et al. 2016: [[432, 450]].
+    duration : str or float
+        Length of the log, to which gaps are cut; by default the longest that a log may have.
     start : str
-        Time of the first sample of the log.
-    duration
-        Not used; every function of the environment takes it.
+        Time of its first sample.
 
     Examples
     --------
     >>> gaps([[432, 450]]).gap_end.values
     array(['1970-01-01T00:07:30.000000000'], dtype='datetime64[ns]')
     """
-    return _make_table(_check_spans(spans, "spans of gaps"), _MISSING, start)
+    return _make_table(_check_spans(spans, "spans of gaps"), _MISSING, duration, start)
 
 
 def _check_spans(spans: Points, where: str, *, optional: bool = False) -> NDArray[np.float64]:
@@ -110,7 +111,7 @@ def losses(
     ]
     begin = np.sort(np.concatenate([good, *bad]))
     spans = np.stack([begin, begin + rng.exponential(length, begin.size)], axis=1)
-    return _make_table(spans, _MISSING, start)
+    return _make_table(spans, _MISSING, duration, start)
 
 
 def _draw_poisson(
@@ -156,4 +157,4 @@ def power_cuts(
     more = np.stack(
         [begin, begin + rng.exponential(duration_seconds(mean, "mean"), begin.size)], axis=1
     )
-    return _make_table(np.concatenate([table, more]), _RESTART, start)
+    return _make_table(np.concatenate([table, more]), _RESTART, duration, start)

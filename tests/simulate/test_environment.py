@@ -99,6 +99,16 @@ def test_random_power_cuts_are_restarts():
     assert set(gap_table(log).cause) == {"restart"}
 
 
+@pytest.mark.parametrize("end", [60.0, 1e10, 1e300])
+@pytest.mark.parametrize("table", [{"profile": "gaps"}, {"profile": "power_cuts"}])
+def test_a_gap_may_end_any_time_after_the_log(table, end):
+    key = "spans" if table["profile"] == "gaps" else "cuts"
+    tables = {"environment": [table | {key: [[50, end], [2 * end, 3 * end]]}]}
+    log = simulate(tables, duration="60s", rate=1.0, start="2261-01-01")
+    assert log["gap_samples"].values.tolist() == [10]
+    assert np.isnan(log["rate"].values[0]).tolist() == [False] * 50 + [True] * 10
+
+
 def test_overlapping_gaps_are_merged():
     world = combine(gaps([[1, 3], [2, 5]]), power_cuts([[4.5, 6]], duration=10.0))
     table = gap_table(simulate({"noise": {"N": 1}}, duration="10s", rate=10.0, environment=world))
