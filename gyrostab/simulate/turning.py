@@ -17,7 +17,10 @@ Array = NDArray[np.float64]
 
 
 def _integrate_turns(table: Array, stick_slip: float, period: float) -> tuple[Any, Any]:
-    """Compute rate [deg/s] and angle [deg] from a table (time, rate) with stick-slip added."""
+    """Compute rate [deg/s] and angle since the start [deg] from a table (time, rate).
+
+    Stick-slip is added.
+    """
     times, rates = table.T
     if times.size == 1:
         times, rates = np.append(times, times + 1.0), np.repeat(rates, 2)
@@ -43,7 +46,7 @@ def _integrate_turns(table: Array, stick_slip: float, period: float) -> tuple[An
     part = np.where(np.diff(times) > 0.0, part, 0.0)  # a step takes no time
     swung = np.concatenate([[0.0], np.cumsum(part)])
 
-    def angle(t: Array) -> Array:
+    def angle_from_first_point(t: Array) -> Array:
         inside, j = pieces(t)
         base = rates[j] + slope[j] * (inside - times[j])
         plain = angles[j] + (rates[j] + base) / 2.0 * (inside - times[j])
@@ -52,6 +55,11 @@ def _integrate_turns(table: Array, stick_slip: float, period: float) -> tuple[An
         edge = np.where(beyond < 0, rates[0], rates[-1])
         wave = wave + edge * (np.sin(omega * t) - np.sin(omega * inside)) / omega
         return np.asarray(plain + edge * beyond - stick_slip * wave)
+
+    at_start = angle_from_first_point(np.zeros(1))
+
+    def angle(t: Array) -> Array:
+        return np.asarray(angle_from_first_point(t) - at_start)
 
     return rate, angle
 

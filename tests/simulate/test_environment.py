@@ -68,6 +68,18 @@ def test_toolface_is_the_integral_of_the_rate(stick_slip, rise):
     np.testing.assert_allclose(turning.accel_z.values, 0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize("stick_slip", [0.0, 0.7])
+@pytest.mark.parametrize("first", [3.3, -4.2])
+def test_toolface_is_that_at_the_start_whenever_the_first_point_is(first, stick_slip):
+    """Steady rotation is the same from any first point on."""
+    options = {"duration": 12.0, "stick_slip": stick_slip, "toolface": 25.0, "inclination": 90.0}
+    turning = rotation([[first, 100.0]], **options)
+    np.testing.assert_allclose(turning["toolface"].values[0], 25.0)
+    expected = rotation([[0, 100.0]], **options)
+    for name in ("toolface", "accel_x", "accel_y"):
+        np.testing.assert_allclose(turning[name], expected[name], rtol=0, atol=1e-9, err_msg=name)
+
+
 def test_vertical_tool_has_gravity_on_its_axis():
     still = rotation([[0, 0]], duration=1.0, inclination=0.0)
     assert (still.accel_z.values == -1.0).all()  # z points down; what holds the tool pushes up
