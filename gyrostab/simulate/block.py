@@ -50,7 +50,9 @@ class Plan:
     coefficients: tuple[Mapping[str, float], ...]  # noise coefficients of each axis
     steps: tuple[Step, ...]  # the effects, in the order in which they act
     sources: Mapping[str, Source]  # channels that are needed, by their names in the log
-    turning: str  # axis that feels the channel ``rotation_rate``; empty when none does
+    #: Axis that feels the channel ``rotation_rate``, also one that is not simulated; empty when
+    #: none does.
+    turning: str
     #: (n, 2): samples that are missing on all axes, [first, one past last], rising; not those of
     #: the recording that the log is simulated like.
     gaps: NDArray[np.int64]
@@ -103,7 +105,7 @@ def next_block(
         )
     true = {axis: np.zeros(index.size) for axis in plan.axes}
     if plan.turning:
-        true[plan.turning] += channels["rotation_rate"] * HOUR
+        true[plan.turning] = channels["rotation_rate"] * HOUR
     by_stage: dict[str, list[int]] = {stage: [] for stage in STAGES}
     for number, step in enumerate(plan.steps):
         by_stage[step.effect.stage].append(number)

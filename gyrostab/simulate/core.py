@@ -78,8 +78,8 @@ def simulate(
         The same seed gives the same bits, whatever the chunks; with and without effects it gives
         the same noise. 0 by default.
     like : xarray.Dataset, optional
-        Regular log whose stamps, gaps and channels are taken; rate, start and axes are then its
-        own.
+        Regular log whose stamps, gaps and channels are taken; rate and start are then its own, and
+        its axes those that the model names, or all.
     environment : xarray.Dataset, optional
         More channels and gaps, from the functions of `gyrostab.simulate.environment` and
         `gyrostab.simulate.losses`.
@@ -146,7 +146,8 @@ def simulate(
     if like is not None:
         import dask.array as da
 
-        recorded = da.asarray(like[signal_name(like)].transpose("axis", "time").data)
+        signal = like[signal_name(like)].sel(axis=list(frame.axes)).transpose("axis", "time")
+        recorded = da.asarray(signal.data)
         data = da.where(da.isnan(recorded).rechunk(data.chunks), np.nan, data)
     return _label_log(made, frame, environment, table, data)
 
@@ -222,14 +223,14 @@ def _make_plan(
     turning = ""
     if "rotation_rate" in present:
         turning = str(environment["rotation_rate"].attrs.get("rotation_axis", ""))
-    if turning and turning not in frame.axes:
+    if turning and turning not in frame.axes and "rotation_rate" not in measured:
         raise OptionError(
             f"{model.source}: the tool rotates about the axis {turning!r}, which the log "
             f"does not have; it has {', '.join(frame.axes)}"
         )
     if turning:
         needed.add("rotation_rate")
-    recorded = _recorded_rates(model, frame, steps, like)
+    recorded = _recorded_rates(model, steps, like)
     return Plan(
         rate=frame.rate,
         oversampling=frame.oversampling,
@@ -264,9 +265,7 @@ def _choose_sources(effect: Effect, measured: list[str]) -> dict[str, str]:
     }
 
 
-def _recorded_rates(
-    model: Model, frame: Frame, steps: list[Step], like: xr.Dataset | None
-) -> dict[str, Source]:
+def _recorded_rates(model: Model, steps: list[Step], like: xr.Dataset | None) -> dict[str, Source]:
     """The recorded rates that effects need, by axis."""
     sources: dict[str, Source] = {}
     for effect in (step.effect for step in steps):
@@ -277,10 +276,10 @@ def _recorded_rates(
                     "recording of rates as like (--like RECORDING), or a model with the motion and "
                     'motion = "true"'
                 )
-            if axis not in frame.axes:
+            if axis not in like["axis"].values:
                 raise SchemaError(
                     f"{model.source}: effect {effect.name!r} needs the rate of axis {axis!r}, "
-                    f"which the log does not have; it has {', '.join(frame.axes)}"
+                    f"which the log does not have; it has {', '.join(like['axis'].values)}"
                 )
             sources[axis] = make_source(like["rate"].sel(axis=axis).to_dataset(name="rate"), "rate")
     return sources

@@ -68,7 +68,8 @@ def make_frame(
                 f"{extra[0]} is taken from the recording given as like; "
                 f"leave out {extra[0]} or like"
             )
-        axes = tuple(str(axis) for axis in like["axis"].values)
+        recorded = tuple(str(axis) for axis in like["axis"].values)
+        axes = tuple(axis for axis in recorded if axis in model.axes) or recorded
         like_rate, size = float(like.attrs["sampling_rate_hz"]), like.sizes["time"]
         return Frame(like_rate, size, first_stamp(like), chosen, axes, factor)
     hertz = model.log.get("rate") if rate is None else rate

@@ -97,6 +97,14 @@ def _record_and_compare(effect: str) -> tuple[xr.Dataset, float]:
     return recording, nats_of(recording, json.loads(effect))
 
 
+def test_axes_that_the_model_does_not_name_are_compared_too():
+    log = environment().isel(time=slice(0, 1000))
+    statistics = simulate_statistics(log, {"noise": {"y": {"N": 0.003}}})[0]
+    assert {*statistics} == {*measure_statistics(log)}
+    assert np.isneginf(statistics["lines/0"]).all()
+    assert np.isfinite(statistics["lines/1"]).all()
+
+
 @pytest.fixture(scope="module")
 def noise_alone() -> xr.Dataset:
     return recording_of()

@@ -117,6 +117,28 @@ def test_a_log_like_a_recording_has_its_stamps_gaps_and_channels():
         simulate({"noise": {"x": {"N": 0.01}}}, like=recorded)
 
 
+def test_a_log_like_a_recording_has_the_axes_that_the_model_names():
+    """Effects may still take the rotation about an axis that is not simulated."""
+    world = [{"profile": "rotation", "points": [[0, 90.0]], "axis": "z"}]
+    recorded = simulate({"noise": {"N": 1.0}, "environment": world}, duration="9s", rate=10.0)
+    recorded = recorded.compute()
+    recorded["rate"][1, 30:40] = np.nan
+    some = {"noise": {"x": {"N": 0.01}, "y": {}}, "bias": {"y": 2.0}}
+    log = simulate(some, like=recorded)
+    assert log["axis"].values.tolist() == ["x", "y"]
+    np.testing.assert_array_equal(np.isnan(log["rate"]), np.isnan(recorded["rate"][:2]))
+    np.testing.assert_array_equal(log["rate"][1].dropna("time"), 2.0)
+    for whole in (recorded, recorded.sel(axis=["x"])):
+        alone = simulate({"noise": {"x": {"N": 0.01}}}, like=whole)
+        np.testing.assert_array_equal(alone["rate"], log["rate"].sel(axis=["x"]))
+    assert simulate({"noise": {"N": 0.01}}, like=recorded).sizes["axis"] == 3
+    for motion, rate in (("true", 90.0 * 3600.0), ("recorded", recorded["rate"].values[2])):
+        leak = {"name": "misalignment", "z": 0.5, "axes": ["x"], "motion": motion}
+        leaking = simulate({"noise": {"x": {}}, "effect": [leak]}, like=recorded)
+        assert leaking["axis"].values.tolist() == ["x"]
+        np.testing.assert_allclose(leaking["rate"].values[0], 5e-4 * rate * np.ones(90), rtol=1e-9)
+
+
 def test_gaps_of_a_recording_are_lost_on_their_axis_and_those_of_the_model_on_all():
     values = np.zeros((2, 200))
     values[0, 30:60] = np.nan

@@ -73,7 +73,8 @@ def check_model(
 def simulate_statistics(log: xr.Dataset, model: Any) -> list[dict[str, Array]]:
     """Compute the statistics of records simulated from a model like a recording.
 
-    They have the stamps, channels and lost samples of the recording.
+    They have the stamps, channels and lost samples of the recording, and no noise on axes that the
+    model does not name.
     """
     from gyrostab import simulate
 
@@ -82,8 +83,9 @@ def simulate_statistics(log: xr.Dataset, model: Any) -> list[dict[str, Array]]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for seed in range(1, _RECORDS + 1):
-            rate = simulate(model, like=log, seed=seed)["rate"].values
-            statistics.append(record_statistics(np.where(lost, np.nan, rate), log))
+            rate = simulate(model, like=log, seed=seed)["rate"]
+            rate = rate.reindex(axis=log["axis"].values, fill_value=0.0)
+            statistics.append(record_statistics(np.where(lost, np.nan, rate.values), log))
     return statistics
 
 
