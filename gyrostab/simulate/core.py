@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -48,6 +48,14 @@ from gyrostab.units import parse_unit
 BLOCK = 2**17
 _RECORDED = "recorded rate of "  # source of an effect, in front of the name of the axis
 _COURSE = "course of "  # source of an effect, in front of the name of a recorded channel
+
+
+class GapTables(NamedTuple):
+    """Gaps of the log by `gap_table`, in which gaps that overlap are one."""
+
+    all: NDArray[np.int64]
+    restarts: NDArray[np.int64]  # losses of power, without other gaps that overlap them
+    added: NDArray[np.int64]  # gaps that a recording does not have
 
 
 def simulate(
@@ -122,9 +130,12 @@ def simulate(
         added = add_environment(made, frame, like, environment)
         environment = combine(*([] if like is None else [take_environment(like)]), added)
         environment = environment.drop_attrs(deep=False)
-        table = gap_table(environment, frame)
-        lost = gap_table(added, frame)
-        plan = _make_plan(made, frame, environment, (table, lost), like)
+        tables = GapTables(
+            gap_table(environment, frame),
+            gap_table(environment, frame, only=RESTART),
+            gap_table(added, frame),
+        )
+        plan = _make_plan(made, frame, environment, tables, like)
         starts = [
             begin_noise(
                 frame.seed,
@@ -149,11 +160,11 @@ def simulate(
         signal = like[signal_name(like)].sel(axis=list(frame.axes)).transpose("axis", "time")
         recorded = da.asarray(signal.data)
         data = da.where(da.isnan(recorded).rechunk(data.chunks), np.nan, data)
-    return _label_log(made, frame, environment, table, data)
+    return _label_log(made, frame, environment, tables.all, data)
 
 
 def _make_setup(
-    model: Model, frame: Frame, table: NDArray[np.int64], effect: Effect, rows: tuple[int, ...]
+    model: Model, frame: Frame, tables: GapTables, effect: Effect, rows: tuple[int, ...]
 ) -> Setup:
     """Make the setup of an effect; its parameters with one number per axis must fit the rows."""
     factor = 1 if effect.stage == "logger" else frame.oversampling
@@ -167,8 +178,8 @@ def _make_setup(
         size=frame.size * factor,
         axes=axes,
         noise={term: np.array([coefficients[term] for coefficients in noise]) for term in TERMS},
-        gaps=table[:, :2] * factor,
-        restarts=table[table[:, 4] == RESTART, :2] * factor,
+        gaps=tables.all[:, :2] * factor,
+        restarts=tables.restarts[:, :2] * factor,
         oversampling=frame.oversampling,
     )
 
@@ -199,11 +210,9 @@ def _make_plan(
     model: Model,
     frame: Frame,
     environment: xr.Dataset,
-    tables: tuple[NDArray[np.int64], NDArray[np.int64]],
+    tables: GapTables,
     like: xr.Dataset | None,
 ) -> Plan:
-    """Make the plan from the tables of all gaps, and of those that a recording does not have."""
-    table, lost = tables
     present = log_channels(environment)
     for name in model.delay:
         if name not in present:
@@ -216,7 +225,7 @@ def _make_plan(
     steps = []
     for effect in sorted(model.effects, key=lambda effect: STAGES.index(effect.stage)):
         rows = tuple(frame.axes.index(axis) for axis in effect.axes or frame.axes)
-        setup = _make_setup(model, frame, table, effect, rows)
+        setup = _make_setup(model, frame, tables, effect, rows)
         factors = _convert_units(effect, environment, present)
         steps.append(Step(effect, setup, rows, factors, _choose_sources(effect, measured)))
     needed = {name for step in steps for name in step.sources.values()}
@@ -248,7 +257,7 @@ def _make_plan(
             **{f"{_RECORDED}{axis}": source for axis, source in recorded.items()},
         },
         turning=turning,
-        gaps=lost[:, :2],
+        gaps=tables.added[:, :2],
         recorded={axis: f"{_RECORDED}{axis}" for axis in recorded},
         bias=tuple(model.bias.get(axis, 0.0) for axis in frame.axes),
     )

@@ -221,8 +221,13 @@ def _outside_error(item: str, first: int, last: int, frame: Frame) -> SchemaErro
     )
 
 
-def gap_table(environment: xr.Dataset, frame: Frame) -> NDArray[np.int64]:
-    """Convert and merge gaps: first missing, first present after, samples, rows, cause."""
+def gap_table(
+    environment: xr.Dataset, frame: Frame, *, only: int | None = None
+) -> NDArray[np.int64]:
+    """Convert and merge gaps: first missing, first present after, samples, rows, cause.
+
+    With the cause `only`, others are left out.
+    """
     if "gap_start" not in environment:
         return np.empty((0, 5), np.int64)
     first, end = (
@@ -236,7 +241,7 @@ def gap_table(environment: xr.Dataset, frame: Frame) -> NDArray[np.int64]:
     for begin, until, cause in sorted(
         zip(first.tolist(), end.tolist(), environment["gap_cause"].values.tolist(), strict=True)
     ):
-        if until <= begin:
+        if until <= begin or only not in (None, cause):
             continue
         if rows and begin < rows[-1][1]:
             rows[-1][1] = max(rows[-1][1], until)

@@ -121,6 +121,20 @@ def test_a_gap_may_end_any_time_after_the_log(table, end):
     assert np.isnan(log["rate"].values[0]).tolist() == [False] * 50 + [True] * 10
 
 
+@pytest.mark.parametrize("lost", [[50, 110], [150, 300], [20, 400]])
+def test_lost_telemetry_does_not_move_a_loss_of_power(lost):
+    def rates(world):
+        effect = {"name": "warm_up", "amplitude": 1.0, "time": 600, "cooling": 90}
+        log = simulate({"effect": [effect]}, duration="500s", rate=1.0, environment=world)
+        return log["rate"].values[0]
+
+    cut = power_cuts([[100, 160]], duration=500.0)
+    plain, both = rates(cut), rates(combine(cut, gaps([lost])))
+    expected = plain.copy()
+    expected[lost[0] : lost[1]] = np.nan
+    np.testing.assert_array_equal(both, expected)
+
+
 def test_overlapping_gaps_are_merged():
     world = combine(gaps([[1, 3], [2, 5]]), power_cuts([[4.5, 6]], duration=10.0))
     table = gap_table(simulate({"noise": {"N": 1}}, duration="10s", rate=10.0, environment=world))
