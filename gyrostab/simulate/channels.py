@@ -110,7 +110,7 @@ def channel(
     values : callable
         Seconds since the start -> values; called for stretches of time, in any order.
     duration : str or float
-        Length of the channel; a number is in seconds.
+        Length of the log, whose end the channel reaches; a number is in seconds.
     start : str or int
         First stamp, ISO 8601.
     sensor_rate : float
@@ -127,7 +127,7 @@ def channel(
     --------
     >>> found = channel("supply_voltage", "V", lambda t: 28.0 - t / 3600, duration="1h")
     >>> found.supply_voltage.sizes
-    Frozen({'time_supply_voltage': 3600})
+    Frozen({'time_supply_voltage': 3601})
     """
     if name in RESERVED_NAMES:
         raise OptionError(
@@ -138,13 +138,18 @@ def channel(
             f"channel {name!r}: the sensor rate {sensor_rate!r} must be a number of Hz "
             "above 0 and up to 1e5"
         )
-    size = max(1, math.ceil(duration_seconds(duration, "duration") * sensor_rate - 1e-6))
+    size = count_samples(duration_seconds(duration, "duration"), sensor_rate)
     dim = f"time_{name}"
     attrs = {"units": unit, "long_name": name.replace("_", " "), **(attributes or {})}
     coordinates = time_coordinate(stamp_ns(start), sensor_rate, size, name=dim)
     return xr.Dataset(
         {name: (dim, _sample_values(values, size, sensor_rate), attrs)}, coords=coordinates
     )
+
+
+def count_samples(seconds: float, sensor_rate: float) -> int:
+    """Return the samples of a channel from the start of a log to its end, or the first after it."""
+    return math.ceil(seconds * sensor_rate - 1e-6) + 1
 
 
 def _sample_values(values: Callable[[Array], Array], size: int, rate: float) -> Any:

@@ -21,6 +21,7 @@ from gyrostab.simulate.channels import (
     channel,
     check_points,
     combine,
+    count_samples,
     inner_unit,
     piecewise,
 )
@@ -79,7 +80,7 @@ def steps(
     Examples
     --------
     >>> steps("pressure", "bar", [[0, 1], [2, 300]], duration=4.0).pressure.values
-    array([  100000.,   100000., 30000000., 30000000.])
+    array([  100000.,   100000., 30000000., 30000000., 30000000.])
     """
     return _make_from_points(channel, unit, points, True, duration, start, sensor_rate)
 
@@ -98,7 +99,7 @@ def ramps(
     Examples
     --------
     >>> ramps("temperature", "degC", [[0, 20], [4, 60]], duration=4.0).temperature.values
-    array([20., 30., 40., 50.])
+    array([20., 30., 40., 50., 60.])
     """
     return _make_from_points(channel, unit, points, False, duration, start, sensor_rate)
 
@@ -130,7 +131,7 @@ def vibration(
 
     Examples
     --------
-    >>> shaken = vibration([[0, 0.0], [1, 10.0]], duration=3.0, band=(700, 800)).vibration
+    >>> shaken = vibration([[0, 0.0], [1, 10.0]], duration=2.0, band=(700, 800)).vibration
     >>> shaken.values, shaken.attrs["band_hz"]
     (array([ 0., 10., 10.]), [700.0, 800.0])
     """
@@ -208,8 +209,7 @@ def _to_seconds(value: Any) -> float:
 def _make_temperature(
     name: str, function: Any, seconds: float, start: Any, sensor_rate: float, lag: float
 ) -> xr.Dataset:
-    size = max(1, math.ceil(seconds * sensor_rate - 1e-6))
-    felt = function(np.arange(size) / sensor_rate)
+    felt = function(np.arange(count_samples(seconds, sensor_rate)) / sensor_rate)
     if lag > 0.0:
         from gyrostab.kernels.thermal import lag_values
 
@@ -313,7 +313,7 @@ def supply(
 
     Examples
     --------
-    >>> supply(duration=4.0, life=4.0, loads=[[1, 2, 0.5]]).supply_voltage.values.round(2)
+    >>> supply(duration=3.0, life=4.0, loads=[[1, 2, 0.5]]).supply_voltage.values.round(2)
     array([29.  , 28.28, 28.11, 26.68])
     """
     columns = ("from [s]", "to [s]", "drop [V]")

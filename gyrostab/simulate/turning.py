@@ -112,7 +112,7 @@ def rotation(
 
     Examples
     --------
-    >>> turning = rotation([[0, 360.0]], duration=1.0, sensor_rate=4.0, inclination=90.0)
+    >>> turning = rotation([[0, 360.0]], duration=0.75, sensor_rate=4.0, inclination=90.0)
     >>> turning.toolface.values, turning.accel_x.values.round(3)
     (array([  0.,  90., 180., 270.]), array([ 1.,  0., -1., -0.]))
     """

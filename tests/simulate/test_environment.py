@@ -32,6 +32,33 @@ def test_a_lag_is_that_of_a_first_order_response():
     )
 
 
+@pytest.mark.parametrize("sensor_rate", [1.0, 0.15, 0.01])
+@pytest.mark.parametrize(
+    "profile",
+    [
+        {
+            "profile": "ramps",
+            "channel": "temperature",
+            "unit": "degC",
+            "points": [[0, 20], [999, 50]],
+        },
+        {"profile": "chamber", "low": 20.0, "high": 50.0, "hold": 10.0, "lag": 60.0},
+    ],
+    ids=lambda profile: profile["profile"],
+)
+def test_a_channel_lasts_to_the_end_of_the_log(profile, sensor_rate):
+    effects = [
+        {"name": "temperature_bias", "sensitivity": 1.0},
+        {"name": "shupe", "sensitivity": 0.5, "lag": 5.0},
+    ]
+    world = [profile | {"sensor_rate": sensor_rate}]
+    short, long = (
+        simulate({"effect": effects, "environment": world}, duration=seconds, rate=2.0)
+        for seconds in (140.0, 300.0)
+    )
+    np.testing.assert_array_equal(short["rate"], long["rate"][:, :280])
+
+
 def test_trip_reaches_the_rock_and_circulation_cools_it():
     down = env.trip(
         [[0, 0], [36000, 3000]],
@@ -42,7 +69,7 @@ def test_trip_reaches_the_rock_and_circulation_cools_it():
         cooling=0.4,
     )
     assert down.temperature.values[89999] == pytest.approx(105.0, abs=0.01)
-    assert down.temperature.values[-1] == pytest.approx(15 + 0.6 * 90, abs=0.01)
+    assert down.temperature.values[-2] == pytest.approx(15 + 0.6 * 90, abs=0.01)
     middle = down.temperature.values[18000:30000]
     # 300 m/h: 0.15 degC/min
     np.testing.assert_allclose(np.diff(middle) * 60, 300 * 0.03 / 60, rtol=1e-6)

@@ -144,10 +144,10 @@ def test_an_effect_alone_is_the_difference_of_two_runs():
     with_effects, without = simulate(model(), seed=5), simulate(model(effect=[]), seed=5)
     difference = (with_effects.rate - without.rate).values
     t = np.arange(1800) / 20
-    bias = 0.02 * (np.interp(t, [0, 89], [20, 20 + 89 * 0.5]) - 25.0)
+    bias = 0.02 * (np.interp(t, [0, 90], [20, 20 + 90 * 0.5]) - 25.0)
     present = ~np.isnan(difference[0])
     np.testing.assert_allclose(difference[0, present], bias[present], rtol=0, atol=1e-9)
-    accel = np.interp(t, np.arange(2250) / 25, with_effects.accel_x.values)
+    accel = np.interp(t, np.arange(2251) / 25, with_effects.accel_x.values)
     np.testing.assert_allclose(
         difference[1, present], (bias + 0.5 * accel)[present], rtol=0, atol=1e-9
     )
