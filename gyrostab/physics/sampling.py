@@ -18,6 +18,7 @@ from gyrostab.units import HOUR
 FAST_INSTRUMENT_SAMPLES = 16
 _PPM = 1e-6
 _MAX_KEPT_SAMPLES = 2**20
+_MIN_PART = 1e-6  # of a sample; smaller ones are rounding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +26,8 @@ class LoggerFilter(Effect):
     """Filter and decimation of the logger, at the rate of the instrument.
 
     A Butterworth low-pass of `order` poles with half power at `cutoff` (bilinear transform) is
-    followed by a moving average over `length`. A sample of the log is the mean of n samples of the
+    followed by a moving average over `length`, in which the oldest sample counts for the part that
+    it fills. A sample of the log is the mean of n samples of the
     instrument (integrate and dump), or with ``pick = 1`` every n-th of them, where n is the
     `oversampling` of the model; what passes the filter above half of the log's rate is then
     aliased. All filters are causal and keep their state between chunks. To explain a recording,
@@ -94,16 +96,28 @@ class LoggerFilter(Effect):
                     "raise oversampling in the model's [log], or lower the cutoff"
                 )
             sections = butter(int(self.order), self.cutoff, fs=setup.rate, output="sos")
-        taps = max(1, round(self.length * setup.rate))
-        if taps > 10_000:
+        whole, part = self._split_length(setup.rate)
+        if whole > 10_000:
             raise OptionError(
-                f"effect {self.name!r}: a length of {self.length:g} s is {taps} samples "
+                f"effect {self.name!r}: a length of {self.length:g} s is {whole} samples "
                 "of the instrument; give at most 10000"
             )
-        return sections, None, taps, None
+        if whole == 0 and part:
+            raise OptionError(
+                f"effect {self.name!r}: a length of {self.length:g} s is shorter than a sample of "
+                f"the instrument's {setup.rate:g} Hz, so that the average changes nothing; "
+                "raise oversampling in the model's [log], or leave length out"
+            )
+        return sections, None, None
+
+    def _split_length(self, rate: float) -> tuple[int, float]:
+        """Return the whole samples in the moving average, and the part of the one before them."""
+        samples = self.length * rate
+        whole = math.floor(samples + _MIN_PART)
+        return whole, samples - whole if samples - whole > _MIN_PART else 0.0
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        sections, inner, taps, memory = state
+        sections, inner, memory = state
         signal = chunk.signal
         if sections is not None:
             from scipy.signal import sosfilt, sosfilt_zi
@@ -111,17 +125,21 @@ class LoggerFilter(Effect):
             if inner is None:
                 inner = sosfilt_zi(sections)[:, None, :] * signal[None, :, :1]
             signal, inner = sosfilt(sections, signal, zi=inner)
-        if taps > 1:
-            memory = np.repeat(signal[:, :1], taps - 1, axis=1) if memory is None else memory
+        whole, part = self._split_length(chunk.rate)
+        weights = [part] * (part > 0.0) + [1.0] * whole  # the oldest sample first
+        if len(weights) > 1:
+            older = len(weights) - 1
+            memory = np.repeat(signal[:, :1], older, axis=1) if memory is None else memory
             history = np.concatenate([memory, signal], axis=1)
-            memory = history[:, 1 - taps :].copy()
+            memory = history[:, -older:].copy()
             total = np.zeros_like(signal)
-            for lag in range(taps):
-                total += history[:, lag : lag + chunk.size]
-            signal = total / taps
+            for lag, weight in enumerate(weights):
+                samples = history[:, lag : lag + chunk.size]
+                total += samples if weight == 1.0 else weight * samples
+            signal = total / (whole + part)
         if self.pick:
             signal = signal[:, :: chunk.setup.oversampling]
-        return signal, (sections, inner, taps, memory)
+        return signal, (sections, inner, memory)
 
     def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
         """List low-passes and averages, for slow and fast instruments; one filter at a time."""
@@ -182,12 +200,13 @@ class LoggerFilter(Effect):
         if self.cutoff:
             ratio = np.tan(np.pi * f / fast) / math.tan(math.pi * self.cutoff / fast)
             response = 1.0 / (1.0 + ratio ** (2 * int(self.order)))
-        for taps in (max(1, round(self.length * fast)), 1 if self.pick else n):
-            if taps > 1:  # mean of `taps` samples
-                response = (
-                    response
-                    * (np.sin(np.pi * taps * f / fast) / (taps * np.sin(np.pi * f / fast))) ** 2
-                )
+        for whole, part in (self._split_length(fast), (1 if self.pick else n, 0.0)):
+            total = whole + part
+            if total > 1.0:  # mean of whole samples and a part of the one before
+                mean = np.sin(np.pi * whole * f / fast) / (total * np.sin(np.pi * f / fast))
+                rest = part / total
+                turn = np.cos(np.pi * (whole + 1) * f / fast)
+                response = response * (mean**2 + rest**2 + 2.0 * rest * mean * turn)
         return np.asarray(response)
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:

@@ -56,6 +56,19 @@ def test_moving_average_reduces_noise_at_short_times_only():
     assert ratio[2] == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.parametrize("samples", [1.0, 1.4, 1.5, 2.0, 7.3])
+def test_moving_average_may_have_a_part_of_a_sample(samples):
+    """The average over the last `samples` intervals of a signal that holds each sample."""
+    noise = np.random.default_rng(6).normal(size=(1, 2000))
+    effect = build_effect("logger_filter", length=samples / 10.0)
+    done = run(effect, size=2000, axes="x", signal=noise, cuts=(1, 2, 9, 700))[0]
+    ends = np.arange(1, 2001.0)
+    integral = np.concatenate([[0.0], noise[0].cumsum()])
+    expected = integral[1:] - np.interp(ends - samples, np.arange(2001.0), integral)
+    known = ends >= samples
+    np.testing.assert_allclose(done[known], expected[known] / samples, rtol=0, atol=1e-9)
+
+
 def test_point_sampling_aliases_and_averaging_does_not():
     common = {
         "noise": {"N": 0.01},
@@ -85,6 +98,7 @@ def test_point_sampling_aliases_and_averaging_does_not():
         {"cutoff": 10.0, "order": 1, "pick": 1},
         {"length": 0.04, "pick": 1},
         {"length": 0.1},
+        {"length": 0.0044, "pick": 1},
     ],
 )
 @pytest.mark.parametrize("term", ["N", "Q", "K"])
@@ -118,6 +132,10 @@ def test_impossible_filter_is_refused():
         build_effect("logger_filter", cutoff=5).begin(setup, rng)
     with pytest.raises(OptionError, match="20000 samples of the instrument; give at most 10000"):
         build_effect("logger_filter", length=2000).begin(setup, rng)
+    for length in (0.04, 0.0999):
+        with pytest.raises(OptionError, match="shorter than a sample of the instrument's 10 Hz"):
+            build_effect("logger_filter", length=length).begin(setup, rng)
+    build_effect("logger_filter", length=0.1).begin(setup, rng)
     with pytest.raises(OptionError, match=r"'order': 2\.5 is not a whole number"):
         build_effect("logger_filter", cutoff=1, order=2.5)
 
