@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 
@@ -30,9 +30,9 @@ class LoggerFilter(Effect):
     it fills. A sample of the log is the mean of n samples of the
     instrument (integrate and dump), or with ``pick = 1`` every n-th of them, where n is the
     `oversampling` of the model; what passes the filter above half of the log's rate is then
-    aliased. All filters are causal and keep their state between chunks. To explain a recording,
-    `instrument` takes the place of n: 1 for a filter at the rate of the log, 0 for a fast
-    instrument (n = 16).
+    aliased. All filters are causal and keep their state between chunks. With ``instrument = 1`` the
+    filter acts on the samples of the log instead. With 0, n is the oversampling of a model, and 16
+    to explain a recording, as of a fast instrument.
 
     References
     ----------
@@ -76,7 +76,7 @@ class LoggerFilter(Effect):
     )
     instrument: float = parameter(
         "1",
-        "n, to explain a recording; 0: 16, a fast instrument",
+        "n: 1 for a filter at the rate of the log; 0: the oversampling, 16 for a recording",
         default=0.0,
         low=0.0,
         high=1000.0,
@@ -84,19 +84,26 @@ class LoggerFilter(Effect):
     )
 
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
-        """Design the sections of the low-pass and the length of the average."""
+        """Design the sections of the low-pass, and check the average."""
+        if self.instrument > 1.0 and self.instrument != setup.oversampling:
+            raise OptionError(
+                f"effect {self.name!r}: instrument = {self.instrument:g} is not the oversampling "
+                f"of the model, which is {setup.oversampling}; give oversampling = "
+                f"{self.instrument:g} in [log], or leave instrument out"
+            )
+        rate = setup.rate * self._samples_at(setup.oversampling) / setup.oversampling
         sections = None
         if self.cutoff:
             from scipy.signal import butter
 
-            if self.cutoff >= setup.rate / 2.0:
+            if self.cutoff >= rate / 2.0:
                 raise OptionError(
                     f"effect {self.name!r}: a cutoff of {self.cutoff:g} Hz is not below half of "
-                    f"the instrument's {setup.rate:g} Hz; "
+                    f"the instrument's {rate:g} Hz; "
                     "raise oversampling in the model's [log], or lower the cutoff"
                 )
-            sections = butter(int(self.order), self.cutoff, fs=setup.rate, output="sos")
-        whole, part = self._split_length(setup.rate)
+            sections = butter(int(self.order), self.cutoff, fs=rate, output="sos")
+        whole, part = self._split_length(rate)
         if whole > 10_000:
             raise OptionError(
                 f"effect {self.name!r}: a length of {self.length:g} s is {whole} samples "
@@ -105,10 +112,18 @@ class LoggerFilter(Effect):
         if whole == 0 and part:
             raise OptionError(
                 f"effect {self.name!r}: a length of {self.length:g} s is shorter than a sample of "
-                f"the instrument's {setup.rate:g} Hz, so that the average changes nothing; "
+                f"the instrument's {rate:g} Hz, so that the average changes nothing; "
                 "raise oversampling in the model's [log], or leave length out"
             )
         return sections, None, None
+
+    def at_oversampling(self, oversampling: int) -> Self:
+        """Return the same filter of a model with this oversampling, with n as its `instrument`."""
+        return replace(self, instrument=float(self._samples_at(oversampling)))
+
+    def _samples_at(self, oversampling: int) -> int:
+        """Return n, the samples that the filter takes in one of the log."""
+        return 1 if self.instrument == 1.0 else oversampling
 
     def _split_length(self, rate: float) -> tuple[int, float]:
         """Return the whole samples in the moving average, and the part of the one before them."""
@@ -118,14 +133,16 @@ class LoggerFilter(Effect):
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         sections, inner, memory = state
-        signal = chunk.signal
+        oversampling = chunk.setup.oversampling
+        samples = self._samples_at(oversampling)
+        signal = _average_samples(chunk.signal, oversampling // samples)
         if sections is not None:
             from scipy.signal import sosfilt, sosfilt_zi
 
             if inner is None:
                 inner = sosfilt_zi(sections)[:, None, :] * signal[None, :, :1]
             signal, inner = sosfilt(sections, signal, zi=inner)
-        whole, part = self._split_length(chunk.rate)
+        whole, part = self._split_length(chunk.rate * samples / oversampling)
         weights = [part] * (part > 0.0) + [1.0] * whole  # the oldest sample first
         if len(weights) > 1:
             older = len(weights) - 1
@@ -134,11 +151,11 @@ class LoggerFilter(Effect):
             memory = history[:, -older:].copy()
             total = np.zeros_like(signal)
             for lag, weight in enumerate(weights):
-                samples = history[:, lag : lag + chunk.size]
-                total += samples if weight == 1.0 else weight * samples
+                past = history[:, lag : lag + signal.shape[1]]
+                total += past if weight == 1.0 else weight * past
             signal = total / (whole + part)
         if self.pick:
-            signal = signal[:, :: chunk.setup.oversampling]
+            signal = signal[:, ::samples]
         return signal, (sections, inner, memory)
 
     def points(self, windows: Windows) -> list[Mapping[str, float | str]]:
@@ -223,6 +240,13 @@ class LoggerFilter(Effect):
         )
         filters = ", ".join(parts) or "nothing"
         return f"The logger filters {self.on_axes()}: {filters}; its samples are {sampling}."
+
+
+def _average_samples(signal: Array, count: int) -> Array:
+    """Average each `count` samples."""
+    if count == 1:
+        return signal
+    return np.asarray(signal.reshape(signal.shape[0], -1, count).mean(axis=2))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -210,7 +210,7 @@ def _sample_log(
             name = plan.steps[number].effect.name
             raise OptionError(
                 f"effect {name!r} follows another effect that has decimated the log already; "
-                "leave one of them out"
+                "leave one of them out, or name it first in the model"
             )
         step, values = act(number, true=true, signal=np.stack(inputs))
         for row, row_values in zip(step.rows, values, strict=True):

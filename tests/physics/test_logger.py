@@ -122,6 +122,20 @@ def test_filter_has_the_predicted_responses(table, term):
     )
 
 
+@pytest.mark.parametrize(
+    "table", [{"length": 0.3}, {"cutoff": 2.0, "order": 3}, {"length": 0.16, "pick": 1}]
+)
+def test_a_filter_at_the_rate_of_the_log_is_the_same_for_any_oversampling(table):
+    effect = {"name": "logger_filter", "instrument": 1, **table}
+    log = {"rate": 10.0, "duration": "100s", "axes": ["x"], "oversampling": 8}
+    plain = simulate({"noise": {"N": 0.01}, "log": log}).rate.values
+    tables = {"noise": {"N": 0.01}, "log": log, "effect": [effect]}
+    filtered = simulate(tables).rate.values
+    expected = run(make_effect(effect), size=1000, axes="x", signal=plain)
+    np.testing.assert_allclose(filtered, expected, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(simulate(tables, chunk=77).rate.values, filtered)
+
+
 def test_impossible_filter_is_refused():
     setup = Setup(rate=10.0, size=100, axes=("x",))
     rng = np.random.default_rng(1)
@@ -136,6 +150,8 @@ def test_impossible_filter_is_refused():
         with pytest.raises(OptionError, match="shorter than a sample of the instrument's 10 Hz"):
             build_effect("logger_filter", length=length).begin(setup, rng)
     build_effect("logger_filter", length=0.1).begin(setup, rng)
+    with pytest.raises(OptionError, match=r"instrument = 16 is not the oversampling of .* is 1; "):
+        build_effect("logger_filter", cutoff=1, instrument=16).begin(setup, rng)
     with pytest.raises(OptionError, match=r"'order': 2\.5 is not a whole number"):
         build_effect("logger_filter", cutoff=1, order=2.5)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -118,8 +117,8 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
 def _effects_on_rows(model: Model, axes: list[str]) -> Iterator[tuple[Effect, list[int]]]:
     """Yield the effects of a model, each with the rows of the axes that it acts on."""
     for effect in model.effects:
-        if isinstance(effect, LoggerFilter):  # it runs at the rate of the instrument
-            effect = replace(effect, instrument=float(model.log.get("oversampling", 1)))
+        if isinstance(effect, LoggerFilter):
+            effect = effect.at_oversampling(int(model.log.get("oversampling", 1)))
         yield (
             effect,
             [row for row, axis in enumerate(axes) if not effect.axes or axis in effect.axes],

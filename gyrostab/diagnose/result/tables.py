@@ -28,7 +28,7 @@ from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 from gyrostab.noise import LAWS
-from gyrostab.physics.sampling import FAST_INSTRUMENT_SAMPLES
+from gyrostab.physics.sampling import FAST_INSTRUMENT_SAMPLES, LoggerFilter
 from gyrostab.simulate.model import Model
 
 Array = NDArray[np.float64]
@@ -187,6 +187,7 @@ def model_tables(
         for axis in baseline["axis"].values
     }
     given_effects = list(own.effects) if own is not None else []
+    given_oversampling = int(own.log.get("oversampling", 1)) if own is not None else 1
     added_effects = [
         fitted_effect.effect for fitted_effect in fitted if fitted_effect.effect is not None
     ]
@@ -194,7 +195,7 @@ def model_tables(
         noise = undo_noise_loss(noise, blocks, added_effects)
     instrument = max(
         [
-            int(own.log.get("oversampling", 1)) if own is not None else 1,
+            given_oversampling,
             # a filter runs at the rate of the instrument
             *(
                 int(getattr(effect, "instrument", 1)) or FAST_INSTRUMENT_SAMPLES
@@ -202,6 +203,13 @@ def model_tables(
             ),
         ]
     )
+    if instrument > given_oversampling:
+        given_effects = [
+            effect.at_oversampling(given_oversampling)
+            if isinstance(effect, LoggerFilter)
+            else effect
+            for effect in given_effects
+        ]
     log = {"log": {"oversampling": instrument}} if instrument > 1 else {}
     band = own.flicker_band if own is not None else Model.flicker_band
     flicker = {"flicker_band": list(band)} if band != Model.flicker_band else {}
