@@ -152,6 +152,8 @@ class Chunk:
     recorded: Mapping[str, Array] = field(default_factory=dict)
     #: (axes, size): signal before the effect [degree hour-1]; for the stages "sensor" and later.
     signal: Array = field(default_factory=lambda: np.empty((0, 0)))
+    #: (axes, size): Q and N in the signal, as they were added; for the stage "sampling".
+    white: Array = field(default_factory=lambda: np.zeros((1, 1)))
     #: (axes, size): squared noise coefficients by symbol before the effect; for the stage "noise".
     level: Mapping[str, Array] = field(default_factory=dict)
 

@@ -135,18 +135,21 @@ class LoggerFilter(Effect):
         sections, inner, memory = state
         oversampling = chunk.setup.oversampling
         samples = self._samples_at(oversampling)
-        signal = _average_samples(chunk.signal, oversampling // samples)
+        count = oversampling // samples
+        signal = _average_samples(chunk.signal, count)
+        # before the log, the filter has followed the rate: the first sample without its noise
+        start = _average_samples(chunk.signal[:, :count] - chunk.white[:, :count], count)
         if sections is not None:
             from scipy.signal import sosfilt, sosfilt_zi
 
             if inner is None:
-                inner = sosfilt_zi(sections)[:, None, :] * signal[None, :, :1]
+                inner = sosfilt_zi(sections)[:, None, :] * start[None]
             signal, inner = sosfilt(sections, signal, zi=inner)
         whole, part = self._split_length(chunk.rate * samples / oversampling)
         weights = [part] * (part > 0.0) + [1.0] * whole  # the oldest sample first
         if len(weights) > 1:
             older = len(weights) - 1
-            memory = np.repeat(signal[:, :1], older, axis=1) if memory is None else memory
+            memory = np.repeat(start, older, axis=1) if memory is None else memory
             history = np.concatenate([memory, signal], axis=1)
             memory = history[:, -older:].copy()
             total = np.zeros_like(signal)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -140,10 +140,10 @@ def next_block(
             step.rows, np.broadcast_to(values, (len(step.rows), index.size)), strict=True
         ):
             true[plan.axes[row]] = true[plan.axes[row]] + part
-    signal = _add_noise(plan, state, by_stage["noise"], act, units, true)
+    signal, white = _add_noise(plan, state, by_stage["noise"], act, units, true)
     for stage in ("rate", "sensor", "electronics"):
         change(stage, signal, true=true)
-    slow = _sample_log(plan, by_stage["sampling"], act, signal, true, count)
+    slow = _sample_log(plan, by_stage["sampling"], act, signal, white, true, count)
     true = (
         {axis: values.reshape(count, factor).mean(axis=1) for axis, values in true.items()}
         if factor > 1
@@ -161,8 +161,8 @@ def _add_noise(
     act: Any,
     units: Sequence[Units],
     true: Mapping[str, Array],
-) -> Array:
-    """True rate and noise, with the noise at the level that the effects give it."""
+) -> tuple[Array, Array]:
+    """True rate and noise, with the noise at the level that the effects give it; its Q and N."""
     size = units[0].size
     signal = np.stack([true[axis] + bias for axis, bias in zip(plan.axes, plan.bias, strict=True)])
     levels = [
@@ -187,32 +187,41 @@ def _add_noise(
                     signal[row] += row_values
                 else:
                     levels[row][term] = row_values
+    rate, white = plan.rate * plan.oversampling, np.zeros(signal.shape)
+    has_sampling = any(step.effect.stage == "sampling" for step in plan.steps)
     for row, axis in enumerate(plan.axes):
-        noise, state.noise[axis] = shape(
-            units[row],
-            {term: np.maximum(values, 0.0) for term, values in levels[row].items()},
-            plan.rate * plan.oversampling,
-            state.noise.get(axis, {}),
-            ramp=plan.coefficients[row]["R"],
-        )
+        level = {term: np.maximum(values, 0.0) for term, values in levels[row].items()}
+        before = state.noise.get(axis, {})
+        ramp = plan.coefficients[row]["R"]
+        noise, state.noise[axis] = shape(units[row], level, rate, before, ramp=ramp)
         signal[row] += noise
-    return signal
+        if has_sampling:
+            values = {term: units[row].values[term] for term in "QN" if term in units[row].values}
+            white[row], _ = shape(replace(units[row], values=values), level, rate, before)
+    return signal, white
 
 
 def _sample_log(
-    plan: Plan, numbers: list[int], act: Any, signal: Array, true: Mapping[str, Array], count: int
+    plan: Plan,
+    numbers: list[int],
+    act: Any,
+    signal: Array,
+    white: Array,
+    true: Mapping[str, Array],
+    count: int,
 ) -> Array:
     """The samples of the log: those that an effect picked, or means over the sampling interval."""
     rows: list[Array] = list(signal)
     for number in numbers:
-        inputs = [rows[row] for row in plan.steps[number].rows]
+        chosen = list(plan.steps[number].rows)
+        inputs = [rows[row] for row in chosen]
         if any(row.size != count * plan.oversampling for row in inputs):
             name = plan.steps[number].effect.name
             raise OptionError(
                 f"effect {name!r} follows another effect that has decimated the log already; "
                 "leave one of them out, or name it first in the model"
             )
-        step, values = act(number, true=true, signal=np.stack(inputs))
+        step, values = act(number, true=true, signal=np.stack(inputs), white=white[chosen])
         for row, row_values in zip(step.rows, values, strict=True):
             rows[row] = row_values
     return np.stack(

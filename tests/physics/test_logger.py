@@ -123,6 +123,31 @@ def test_filter_has_the_predicted_responses(table, term):
 
 
 @pytest.mark.parametrize(
+    "table",
+    [
+        {"cutoff": 0.02, "order": 1},
+        {"cutoff": 0.05, "order": 3},
+        {"length": 10.0},
+        {"length": 10.0, "cutoff": 0.1, "instrument": 1},
+    ],
+)
+def test_a_filtered_log_begins_with_no_more_noise_than_it_has_later(table):
+    """An ensemble of axes; the filter has followed the constant rate before the log."""
+    filtering = {"name": "logger_filter", **table}
+    offset = {"name": "bias_jump", "step": 30.0, "at": 0.0}
+    axes = [f"a{number}" for number in range(40)]
+    tables = {
+        "noise": {"N": 0.01},
+        "bias": dict.fromkeys(axes, 20.0),
+        "effect": [offset, filtering],
+        "log": {"axes": axes, "rate": 10.0, "duration": "150s", "oversampling": 2},
+    }
+    error = simulate(tables).rate.values - 50.0
+    later = np.sqrt(np.mean(error[:, 1000:] ** 2))
+    assert np.sqrt(np.mean(error[:, :100] ** 2, axis=0)).max() < 1.5 * later
+
+
+@pytest.mark.parametrize(
     "table", [{"length": 0.3}, {"cutoff": 2.0, "order": 3}, {"length": 0.16, "pick": 1}]
 )
 def test_a_filter_at_the_rate_of_the_log_is_the_same_for_any_oversampling(table):
@@ -132,7 +157,7 @@ def test_a_filter_at_the_rate_of_the_log_is_the_same_for_any_oversampling(table)
     tables = {"noise": {"N": 0.01}, "log": log, "effect": [effect]}
     filtered = simulate(tables).rate.values
     expected = run(make_effect(effect), size=1000, axes="x", signal=plain)
-    np.testing.assert_allclose(filtered, expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(filtered[:, 100:], expected[:, 100:], rtol=0, atol=1e-9)
     np.testing.assert_array_equal(simulate(tables, chunk=77).rate.values, filtered)
 
 
