@@ -16,6 +16,7 @@ from gyrostab.physics.registry import is_number
 from gyrostab.schema import GAP_CAUSES, log_channels
 from gyrostab.simulate.channels import MAX_DURATION_S, combine, convert_units
 from gyrostab.simulate.model import PROFILES, Model
+from gyrostab.simulate.noise import stream
 from gyrostab.time.durations import duration_seconds
 from gyrostab.time.grid import (
     TimeGridIndex,
@@ -134,11 +135,13 @@ def add_environment(
 ) -> xr.Dataset:
     """Channels and gaps of the model and of `environment`, without those of a recording."""
     parts = []
+    counts: dict[str, int] = {}
     for name, values in model.environment:
         function = PROFILES[name][0]
+        counts[name] = counts.get(name, 0) + 1
         arguments = {"duration": frame.size / frame.rate, "start": frame.start, **values}
         if "seed" in inspect.signature(function).parameters:
-            arguments.setdefault("seed", frame.seed)
+            arguments.setdefault("seed", _number_seed(frame.seed, name, counts[name]))
         parts.append(function(**arguments))
     if environment is not None:
         _check_environment(environment, frame)
@@ -151,6 +154,11 @@ def add_environment(
             environment = environment.drop_vars("time", errors="ignore").assign_coords(grid)
         parts.append(convert_units(environment))
     return combine(*parts)
+
+
+def _number_seed(seed: int, name: str, number: int) -> int:
+    """Return the seed of a profile: that of the log for the first one of its name."""
+    return seed if number == 1 else int(stream(seed, "profile", name, number).integers(2**63))
 
 
 def _check_environment(environment: Any, frame: Frame) -> None:

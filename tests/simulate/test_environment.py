@@ -131,6 +131,22 @@ def test_losses_have_their_rate_and_length_and_come_in_bursts():
     assert counts.mean() == pytest.approx(5 + 49 * 5 * 120 / 3600, rel=0.25)
 
 
+def test_profiles_of_one_name_have_different_random_numbers():
+    world = {"profile": "losses", "per_hour": 20, "bursts_per_hour": 0}
+    frame = {"rate": 1.0, "duration": "50h", "axes": ["x"]}
+
+    def lost(*profiles):
+        log = simulate({"log": frame, "environment": list(profiles)}, seed=1)
+        return np.isnan(log["rate"].values[0])
+
+    first, both = lost(world), lost(world, world)
+    assert both[first].all()
+    assert both.mean() == pytest.approx(1.0 - (1.0 - first.mean()) ** 2, rel=0.05)
+    np.testing.assert_array_equal(
+        lost(world | {"seed": 5}, world | {"seed": 5}), lost(world | {"seed": 5})
+    )
+
+
 def test_random_power_cuts_are_restarts():
     cut = power_cuts(duration="240h", per_day=4, seed=1)
     assert cut.sizes["gap"] == pytest.approx(40, abs=20)
