@@ -51,7 +51,7 @@ def step_means(positions: Sequence[float], levels: Sequence[Any], first: int, si
     where, values = np.asarray(positions, np.float64), np.asarray(levels, np.float64)
     steps = np.diff(values, axis=0)
     means = values[np.searchsorted(where, first + np.arange(size), side="right")]
-    index = np.floor(where).astype(np.int64) - first
+    index = np.clip(np.floor(where) - first, -1, size).astype(np.int64)
     inside = (index >= 0) & (index < size) & (where > np.floor(where))
     share = (index + first + 1 - where)[inside]
     np.add.at(means, index[inside], steps[inside] * share.reshape(-1, *(1,) * (values.ndim - 1)))

@@ -34,6 +34,13 @@ def test_means_of_steps_are_integrals(positions, cut):
         np.testing.assert_allclose(means[:, i], inside @ levels, atol=1e-12)
 
 
+@pytest.mark.parametrize("at", [1e300, np.inf])
+def test_a_step_after_all_logs_changes_nothing(at):
+    with np.errstate(all="raise"):
+        jump = run(build_effect("bias_jump", step=1.0, at=at), size=100)
+    np.testing.assert_array_equal(jump, np.zeros((3, 100)))
+
+
 def test_jump_has_the_allan_variance_of_a_step():
     effect = {"name": "bias_jump", "step": 0.1, "at": 300, "axes": ["x"]}
     log = simulate({"effect": [effect]}, duration="600s", rate=10)
