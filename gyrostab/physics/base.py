@@ -8,6 +8,7 @@ automatically. See docs/physics/README.md.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
@@ -78,9 +79,11 @@ class Parameter:
             if (
                 isinstance(number, bool)
                 or not isinstance(number, int | float | np.number)
-                or math.isnan(number)
+                or number != number  # not a number
             ):
                 raise OptionError(f"{where}: {number!r} is not a number; give one in {self.unit}")
+            if isinstance(number, int) and abs(number) > sys.float_info.max:
+                raise OptionError(f"{where}: the number is too large; give one in {self.unit}")
             if not self.low <= number <= self.high:
                 raise OptionError(
                     f"{where}: {number:g} {self.unit} is outside of the allowed range "

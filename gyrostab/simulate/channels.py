@@ -174,7 +174,7 @@ def combine(*parts: xr.Dataset) -> xr.Dataset:
     Raises
     ------
     OptionError
-        When two of them have a channel of the same name.
+        When two of them have a channel of the same name, or one has that of the times of another.
 
     Examples
     --------
@@ -184,6 +184,7 @@ def combine(*parts: xr.Dataset) -> xr.Dataset:
     ['temperature', 'vibration']
     """
     names: list[Any] = []
+    stamps = {str(name) for part in parts for name in part.coords}
     channel_groups, tables = [], []
     for part in parts:
         gaps = [name for name, variable in part.variables.items() if variable.dims == ("gap",)]
@@ -191,6 +192,12 @@ def combine(*parts: xr.Dataset) -> xr.Dataset:
             tables.append(part[gaps])
         channels = part.drop_vars(gaps)
         twice = [name for name in channels.data_vars if name in names]
+        of_times = [name for name in channels.data_vars if str(name) in stamps]
+        if of_times:
+            raise OptionError(
+                f"the environment has a channel {of_times[0]!r}, which is the name of the times of "
+                "another channel; rename it (channel = ...)"
+            )
         if twice:
             raise OptionError(
                 f"the environment has the channel {twice[0]!r} twice; leave one out, "

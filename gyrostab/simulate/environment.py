@@ -69,7 +69,7 @@ def steps(
     channel, unit : str
         Name and unit of the channel.
     points : list of (time, value)
-        Each value [unit] holds from its time [s] to the next.
+        Each value [unit] holds from its time [s] to the next, and the first one before it too.
     duration : str or float
         Length of the log.
     start : str
@@ -117,8 +117,8 @@ def vibration(
     Parameters
     ----------
     points : list of (time, rms)
-        Each rms acceleration [g] holds from its time [s] to the next. Wang et al. 2016: [[0, 0.02],
-        [330, 13.39], [630, 0.02]].
+        Each rms acceleration [g] holds from its time [s] to the next, and the first one before it
+        too. Wang et al. 2016: [[0, 0.02], [330, 13.39], [630, 0.02]].
     band : (float, float)
         Edges of the band [Hz]; Wang et al. 2016: up to 1 g^2/Hz at 700 to 800 Hz.
     duration, start, sensor_rate
@@ -135,9 +135,12 @@ def vibration(
     >>> shaken.values, shaken.attrs["band_hz"]
     (array([ 0., 10., 10.]), [700.0, 800.0])
     """
-    low, high = (float(edge) for edge in band)
+    try:
+        low, high = (float(edge) for edge in band)
+    except (TypeError, ValueError):
+        low = high = math.nan
     if not 0.0 <= low < high:
-        raise OptionError(f"band of vibration {list(band)}: give [lower, higher] frequency in Hz")
+        raise OptionError(f"band of vibration {band!r}: give [lower, higher] frequency in Hz")
     return _make_from_points(
         "vibration", "g", points, True, duration, start, sensor_rate, band_hz=[low, high]
     )
@@ -188,6 +191,11 @@ def chamber(
         raise OptionError(f"chamber: first is 'low' or 'high', not {first!r}")
     seconds, wait = duration_seconds(duration, "duration"), _to_seconds(hold)
     way = (high - low) / speed * 60.0
+    if (wait + way) * sensor_rate < 1.0:
+        raise OptionError(
+            f"chamber: half a cycle takes {wait + way:g} s, less than the interval of a sensor "
+            f"with {sensor_rate:g} Hz; give a longer hold, a lower speed or a higher sensor_rate"
+        )
     count = math.ceil(seconds / (wait + way)) + 1
     begin = np.arange(count) * (wait + way)
     ends = np.where(np.arange(count) % 2 == (first == "high"), low, high)

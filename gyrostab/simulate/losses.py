@@ -87,7 +87,7 @@ def losses(
     burst : str or float
         Mean length of such a spell, exponentially distributed [s].
     within : float
-        How many times more losses there are in such a spell [1].
+        How many times as many losses there are in such a spell, at least 1 [1].
 
     Examples
     --------
@@ -101,12 +101,13 @@ def losses(
         "bursts_per_hour": bursts_per_hour,
         "within": within,
     }.items():
-        if not value >= 0.0:
-            raise OptionError(f"losses: {name}={value!r} must not be below zero")
+        least = 1 if name == "within" else 0
+        if not value >= least:
+            raise OptionError(f"losses: {name}={value!r} must not be below {least}")
     rng = stream(seed, "losses")
     good = _draw_poisson(rng, 0.0, seconds, per_hour)
     bad = [
-        _draw_poisson(rng, begin, begin + rng.exponential(spell), per_hour * max(0.0, within - 1.0))
+        _draw_poisson(rng, begin, begin + rng.exponential(spell), per_hour * (within - 1.0))
         for begin in _draw_poisson(rng, 0.0, seconds, bursts_per_hour)
     ]
     begin = np.sort(np.concatenate([good, *bad]))

@@ -147,7 +147,13 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
     0.005
     """
     if isinstance(model, Mapping):
-        where, tables, text = "model", dict(model), json.dumps(model, default=str)
+        try:
+            where, tables, text = "model", dict(model), json.dumps(model, default=str)
+        except (TypeError, ValueError) as error:
+            raise OptionError(
+                f"the mapping of the model cannot be kept as text ({error}); "
+                "give the tables of docs/simulate.md, with names as text"
+            ) from error
     elif not isinstance(model, str | os.PathLike):
         raise OptionError(
             f"the model is of type {type(model).__name__}; give a TOML file, a mapping of its "
@@ -370,6 +376,8 @@ def _read_profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[st
             if key in _WORDS
             else (list | tuple, "a list")
             if key in _LISTS
+            else (bool, "true or false")
+            if isinstance(arguments[key].default, bool)
             else (object, "")
         )
         if not isinstance(value, kind) or value == "":

@@ -32,6 +32,9 @@ Array = NDArray[np.float64]
 #: Lowest frequency of flicker noise [Hz] unless a model says otherwise: flat within 0.2 % to
 #: averaging times of 20 h.
 FLICKER_LOW = 5e-9
+#: Lowest frequency that flicker noise may have [Hz], far below that of any log: at most 64
+#: processes then make it, up to the highest sampling rates.
+FLICKER_LOWEST = 1e-30
 #: Samples of a block.
 CHUNK = 2**18
 _PIECE = 2**13
@@ -88,10 +91,11 @@ def begin_noise(
     """
     streams = {term: stream(seed, "noise", axis, term) for term in "QNBK" if term in terms}
     low, high = flicker_band
-    if not 0.0 < low < high:
+    if not FLICKER_LOWEST <= low < high:
+        problem = "is empty" if low >= high else f"begins below {FLICKER_LOWEST:g} Hz"
         raise OptionError(
-            f"the band of flicker noise {low:g} to {high:g} Hz is empty; "
-            "give the lower frequency, above 0, and the higher one"
+            f"the band of flicker noise {low:g} to {high:g} Hz {problem}; "
+            f"give the lower frequency, from {FLICKER_LOWEST:g} Hz up, and the higher one"
         )
     times = flicker_times(rate, low=low, high=high)
     position = (

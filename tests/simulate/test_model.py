@@ -76,6 +76,23 @@ from tests.support.simulated import BIASED, LOG, WORLD, model
         ({"environment": [{"profile": "losses", "per_hour": 1e300}]}, "at most 1e8 gaps"),
         ({"environment": [{"profile": "losses", "seed": "x"}]}, "seed='x': give a whole number"),
         ({"delay": {"q": np.inf}}, r"\[delay\]: q = inf is not a number up to 86400; give one in "),
+        ({"environment": [WORLD[0] | {"band": [1]}]}, r"band of vibration \[1\]: give \[lower, hi"),
+        (
+            {"environment": [WORLD[0] | {"band": [[1], [2]]}]},
+            r"band of vibration \[\[1\], \[2\]\]:",
+        ),
+        (
+            {"environment": [WORLD[1], WORLD[1] | {"channel": "time_temperature"}]},
+            "a channel 'time_temperature', which is the name of the times of another",
+        ),
+        (
+            {"environment": [{"profile": "chamber", "speed": 1e12, "hold": 0}]},
+            "half a cycle takes 6e-09 s, less than the interval of a sensor with 1 Hz; give",
+        ),
+        ({"environment": [WORLD[2] | {"accelerations": "false"}]}, "'false' is not true or false"),
+        ({"environment": [{"profile": "losses", "within": 0.5}]}, "within=0.5 must not be below 1"),
+        ({"effect": [BIASED[0] | {"sensitivity": 10**400}]}, "'sensitivity': the number is too la"),
+        ({("a",): 1}, "mapping of the model cannot be kept as text .*; give the tables of docs"),
         (
             {"environment": [{"profile": "chamber", "lag": "5 m"}]},
             "the unit 'm' is not known here; give the number in s",
@@ -84,7 +101,7 @@ from tests.support.simulated import BIASED, LOG, WORLD, model
 )
 def test_invalid_model_is_explained(wrong, words):
     with pytest.raises(OptionError, match=words):
-        simulate(model(**wrong))
+        simulate(model() | wrong)
 
 
 def test_a_wrong_effect_names_file_and_place(tmp_path):
