@@ -167,16 +167,15 @@ def _draw_record(product: xr.Dataset) -> go.Figure:
 
 def _average_windows(product: xr.Dataset) -> xr.Dataset:
     """Average the surface over all windows, as one window with the terms of all of them."""
-    part = _thin_product(product, _MAX_WINDOWS, _MAX_TAUS)
-    surface = part[[name for name in part.data_vars if part[name].dims[-1:] == ("tau",)]]
+    surface = product[[name for name in product.data_vars if product[name].dims[-1:] == ("tau",)]]
     mean = surface.mean("time", keep_attrs=True).expand_dims(time=1, axis=1)
-    record = part.isel(time=[part.sizes["time"] // 2])
-    record = record.assign({name: mean[name].transpose(*part[name].dims) for name in surface})
-    if "window_trend" in part:  # ramps add the mean of their squares to the mean surface
-        trend = (part["window_trend"] ** 2).mean("time") ** 0.5
+    record = product.isel(time=[product.sizes["time"] // 2])
+    record = record.assign({name: mean[name].transpose(*product[name].dims) for name in surface})
+    if "window_trend" in product:  # ramps add the mean of their squares to the mean surface
+        trend = (product["window_trend"] ** 2).mean("time") ** 0.5
         record["window_trend"] = trend.expand_dims(time=1, axis=1)
     # the mean of that has a sign, and does not belong to the root mean square of the other
-    return record.drop_vars("difference_trend", errors="ignore")
+    return _thin_product(record.drop_vars("difference_trend", errors="ignore"), 1, _MAX_TAUS)
 
 
 def _draw_coefficients(product: xr.Dataset, gaps: list[dict[str, Any]]) -> go.Figure:

@@ -99,6 +99,16 @@ def test_the_record_is_the_mean_of_the_windows_and_its_fit_follows():
     )
 
 
+def test_each_window_of_a_long_product_enters_the_record_once():
+    product = synthetic.product(windows=1600, axes="x").load()
+    product["avar"][:, 801] *= 1e6
+    figures = _figures(product)
+    measured = figures["record"]["data"][0]
+    assert _decode_numbers(figures["coefficients"]["data"][0]["x"]).size < 1600
+    expected = np.sqrt(np.nanmean(product.avar.values[0], axis=0))
+    np.testing.assert_allclose(_decode_numbers(measured["y"]), expected, rtol=1e-6)
+
+
 def test_the_fit_of_the_record_follows_through_gaps():
     values = np.random.default_rng(7).standard_normal(36_000)
     values[(np.arange(36_000) % 1500) < 20] = np.nan
