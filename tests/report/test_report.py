@@ -28,10 +28,11 @@ class _Page(HTMLParser):
         super().__init__()
         self.rows: list[list[str]] = []
         self.images: list[str] = []
+        self.on_screen: list[str] = []
         self.links: list[str] = []
         self.ids: list[str] = []
         self.text = ""
-        self.open: list[str] = []
+        self.open: list[tuple[str, str]] = []
 
     def handle_starttag(self, tag, attrs):
         if tag == "tr":
@@ -44,16 +45,19 @@ class _Page(HTMLParser):
         if tag == "img":
             self.images.append(dict(attrs)["src"])
             assert dict(attrs)["alt"]
+            if not any("static" in classes for _, classes in self.open):
+                self.on_screen.append(dict(attrs)["alt"])
         if tag not in ("meta", "img", "input"):
-            self.open.append(tag)
+            self.open.append((tag, dict(attrs).get("class", "")))
 
     def handle_endtag(self, tag):
-        assert self.open.pop() == tag
+        assert self.open.pop()[0] == tag
 
     def handle_data(self, data):
-        if "script" not in self.open:
+        tags = [tag for tag, _ in self.open]
+        if "script" not in tags:
             self.text += data
-        if self.open and self.open[-1] in ("td", "th"):
+        if tags and tags[-1] in ("td", "th"):
             self.rows[-1][-1] += data
 
 
@@ -78,6 +82,10 @@ def test_page_is_self_contained(page):
     assert len(page.images) == 7
     for image in page.images:
         assert base64.b64decode(image.split(",")[1]).startswith(b"\x89PNG")
+
+
+def test_a_screen_shows_the_signal_and_a_print_the_figures_in_place_of_charts(page):
+    assert page.on_screen == ["Signal as recorded"]
 
 
 def test_coefficient_table_holds_medians_ranges_and_shares(page):
