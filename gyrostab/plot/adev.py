@@ -28,6 +28,7 @@ from gyrostab.plot.style import (
     write_in_middle,
 )
 from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY, check_surface, with_axis
+from gyrostab.time.stamps import label_stamp
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -117,11 +118,10 @@ def plot_adev(
         figure.legend(loc="outside lower left", frameon=False)
     else:
         panel.legend()
-    stamp = str(np.datetime_as_string(window["time"].values, unit="s")).replace("T", " ")
     title_figure(
         figure,
         f"{variance_name(product)} deviation of axis {name}",
-        f"window centred on {stamp} UTC",
+        f"window centred on {label_stamp(window['time'].values)} UTC",
     )
     return figure
 

@@ -34,6 +34,7 @@ from gyrostab.report.charts import (
     stacked_panels,
 )
 from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY
+from gyrostab.time.stamps import label_stamp
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -94,7 +95,7 @@ def window_data(product: xr.Dataset) -> str:
     content = {
         "axes": names,
         "colours": [axis_style(product, name)["color"] for name in names],
-        "times": [str(time).replace("T", " ") for time in part["time"].values.astype("M8[s]")],
+        "times": [label_stamp(time) for time in part["time"].values],
         "tau": part["tau"].values.tolist(),
         "values": [
             {

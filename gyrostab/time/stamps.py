@@ -72,6 +72,17 @@ def format_stamp(stamp: int) -> str:
     return "no stamp" if np.isnat(date) else str(date)
 
 
+def label_stamp(time: Any) -> str:
+    """Format a datetime64 as a label, with milliseconds if it is between two seconds.
+
+    Examples
+    --------
+    >>> label_stamp(np.datetime64("2026-11-20T14:00:00.250")), label_stamp(np.datetime64("2026-11"))
+    ('2026-11-20 14:00:00.250', '2026-11-01 00:00:00')
+    """
+    return format_stamp(int(to_nanoseconds(time))).replace("T", " ").removesuffix(".000")
+
+
 def split_instant(text: str) -> tuple[int, int, int, int] | None:
     """Split a date and time into year, month, day and nanoseconds after its midnight UTC.
 

@@ -297,7 +297,7 @@ def test_adev_draws_the_requested_window(product):
     words = [text.get_text() for text in ax.get_legend().get_texts()]
     assert any(word.startswith("N = ") and "deg/√h" in word for word in words)
     assert any(word.startswith("R < ") and "deg/h²" in word for word in words)
-    assert str(when)[:19].replace("T", " ") in figure.get_suptitle()
+    assert f"centred on {str(when)[:23].replace('T', ' ')} UTC" in figure.get_suptitle()
 
 
 def test_adev_without_a_time_avoids_the_gap(product):

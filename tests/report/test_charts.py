@@ -75,6 +75,13 @@ def test_windows_of_every_axis_are_in_the_page():
         assert (values["high"][inside] > measured[inside]).all()
 
 
+def test_windows_shorter_than_a_second_have_different_labels():
+    product = synthetic.product(axes="x").isel(time=slice(3))
+    product["time"] = product.time[0].values + np.arange(3) * np.timedelta64(50, "ms")
+    labels = json.loads(window_data(product))["times"]
+    assert np.diff(np.array(labels, dtype="M8[ms]")).astype(int).tolist() == [50, 50]
+
+
 def test_the_map_shows_the_first_axis_by_time_and_averaging_time():
     product = synthetic.product()
     trace = _figures(product)["map"]["data"][0]
@@ -330,7 +337,7 @@ def test_a_browser_draws_the_page_without_errors_or_requests(tmp_path, width):
     _check_access(state, width)
     assert state["drawn"] >= 5
     assert {"select", "input"} <= {row["tag"] for row in state["controls"]}
-    times = [str(time).replace("T", " ") for time in product.time.values.astype("M8[s]")]
+    times = [str(time).replace("T", " ") for time in product.time.values.astype("M8[ms]")]
     assert times[20] in state["before"][0]
     assert state["after"][0] == f"axis x, window centred on {times[3]} UTC"
     assert state["axis"][0] == f"axis y, window centred on {times[3]} UTC"
