@@ -16,6 +16,8 @@ import pkgutil
 import sys
 from collections.abc import Sequence
 
+from cyclopts import CycloptsError
+
 from gyrostab.cli import commands
 from gyrostab.cli.console import (
     app,
@@ -85,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         raise
     except Exception as error:
-        if debug:
+        if debug and not isinstance(error, CycloptsError):
             raise
         return describe_error(error)
     return 0

@@ -17,7 +17,14 @@ from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
-from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, UnusedCliTokensError
+from cyclopts import (
+    App,
+    CycloptsError,
+    MissingArgumentError,
+    Parameter,
+    UnknownCommandError,
+    UnusedCliTokensError,
+)
 
 from gyrostab.cli.options import Common, read_toml
 from gyrostab.errors import SYSTEM_ERRNOS, GyrostabError, OptionError
@@ -198,6 +205,10 @@ def _describe_command_line(error: CycloptsError) -> str:
         if joined := _join_duration(error):
             return f"{joined}, without a blank: a duration is one word"
         text = f"Too many arguments: {' '.join(error.unused_tokens or [])}."
+    elif isinstance(error, UnknownCommandError) and (error.unused_tokens or [""])[0][:1] == "-":
+        option, *rest = error.unused_tokens or []
+        chosen = next((token for token in rest if token in app), "COMMAND")
+        text = f"Options come after the command: gyrostab {chosen} {option} ..."
     elif isinstance(error, MissingArgumentError) and error.argument and not error.keyword:
         text = f"{error.argument.name.removesuffix('...')} is missing."
     else:

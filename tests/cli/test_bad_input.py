@@ -217,6 +217,14 @@ def test_bad_input_is_one_message_and_nothing_left_behind(case, tmp_path, capfd)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.parametrize("option", ["--overwrite", "--workers=1", "--debug", "-o"])
+def test_an_option_before_the_command_is_said_to_come_after_it(option, log, capfd):
+    assert call(option, "run", log) == 2
+    (message,) = capfd.readouterr().err.splitlines()
+    assert message.startswith("gyrostab: Options come after the command: ")
+    assert f"gyrostab run {option} ..." in message
+
+
 @pytest.mark.parametrize("make", [
     lambda log, name: ["scan", f"{name}.csv"],
     lambda log, name: ["ingest", log, "-o", "log.nc", "--channel", f"{name}.csv"],
