@@ -62,8 +62,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")
     tokens = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in tokens
-    # abandoned tasks of zarr would print tracebacks
-    logging.getLogger("asyncio").disabled = not debug
     try:
         app.config = read_config(
             tokens, [command for command in app if not command.startswith("-")]
@@ -71,6 +69,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with show_plain_warnings(), sigterm_as_interrupt():
             attached = attach_negative_values(tokens)
             command, bound, _ = app.parse_args(attached, exit_on_error=False, print_error=False)
+            debug = debug or getattr(bound.arguments.get("common"), "debug", False)  # in --config
+            # abandoned tasks of zarr would print tracebacks
+            logging.getLogger("asyncio").disabled = not debug
             with protect_inputs(find_inputs(bound.arguments)):
                 command(*bound.args, **bound.kwargs)
     except KeyboardInterrupt as stop:

@@ -377,6 +377,9 @@ def test_a_fault_of_ours_is_exit_code_1_without_traceback(log, tmp_path, monkeyp
     assert "Traceback" not in shown
     with pytest.raises(ZeroDivisionError):
         call("run", log, "-o", tmp_path / "out.nc", *WINDOW, "--debug")
+    (tmp_path / "run.toml").write_text("[run]\ndebug = true\n")
+    with pytest.raises(ZeroDivisionError):
+        call("run", log, "-o", tmp_path / "out.nc", *WINDOW, "--config", tmp_path / "run.toml")
 
 
 def test_progress_is_a_plain_line_per_stage_away_from_a_terminal(log, tmp_path, capfd):
