@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -64,12 +65,15 @@ def product_charts(product: xr.Dataset, log: xr.Dataset | None = None) -> list[C
     if min(surface.sizes["time"], surface.sizes["tau"]) > 1:
         title = f"Dynamic {variance} deviation as a surface"
         charts.append(("surface", title, _draw_surface(surface)))
-    thinned = {"coefficients": times, "map": surface, "surface": surface}
+    drawn: dict[str, Mapping[Any, int]] = {
+        "record": {"tau": surface.sizes["tau"]},
+        "coefficients": times.sizes,
+    }
     return [
         Chart(
             name,
             title,
-            _describe_thinning(product, thinned.get(name, product)),
+            _describe_thinning(product, drawn.get(name, surface.sizes)),
             embeddable(figure.to_json()),
         )
         for name, title, figure in charts
@@ -126,9 +130,13 @@ def _deviation_label(product: xr.Dataset) -> str:
     return DEVIATION_LABEL.replace("Allan", variance_name(product))
 
 
-def _describe_thinning(product: xr.Dataset, part: xr.Dataset) -> str:
-    every = product.sizes["time"] / part.sizes["time"]
-    return f" One window in {every:.3g} is drawn." if every > 1 else ""
+def _describe_thinning(product: xr.Dataset, drawn: Mapping[Any, int]) -> str:
+    """Say which share of the windows and averaging times is drawn, if not all."""
+    return "".join(
+        f" One {name} in {product.sizes[dim] / drawn[dim]:.3g} is drawn."
+        for dim, name in (("time", "window"), ("tau", "averaging time"))
+        if drawn.get(dim, product.sizes[dim]) < product.sizes[dim]
+    )
 
 
 def _draw_record(product: xr.Dataset) -> go.Figure:

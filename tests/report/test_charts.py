@@ -143,12 +143,26 @@ def test_a_long_product_is_thinned_and_says_so(tmp_path):
     product = synthetic.product(windows=2500)
     charts = {chart.name: chart for chart in product_charts(product)}
     assert "One window in 2.5 is drawn." in charts["coefficients"].note
-    assert "One window in 12.5 is drawn." in charts["map"].note
+    for name in ("map", "window", "surface"):
+        assert charts[name].note == " One window in 12.5 is drawn."
+    assert charts["record"].note == ""
     times = _decode_numbers(json.loads(charts["map"].figure)["data"][0]["x"])
     assert times.size == 200
     stamps = product.time.values.astype("M8[ms]").astype(float)
     assert times[[0, -1]] == pytest.approx(stamps[[0, -1]], abs=1)
     assert write_report(product, tmp_path / "report.html").stat().st_size < 8e6
+
+
+def test_thinned_averaging_times_are_in_the_captions():
+    values = np.random.default_rng(1).standard_normal(1500)
+    log = make_log(values, rate=10.0, unit="deg/h")
+    product = fit_noise(davar(log, window="1min", step="1min", taus="all"), terms="N")
+    notes = {chart.name: chart.note for chart in product_charts(product)}
+    drawn = len(json.loads(window_data(product))["tau"])
+    assert product.sizes["tau"] == 200
+    text = f" One averaging time in {200 / drawn:.3g} is drawn."
+    assert notes.pop("coefficients") == ""
+    assert notes == dict.fromkeys(("record", "map", "window", "surface"), text)
 
 
 def test_names_of_the_user_do_not_become_markup():
