@@ -46,14 +46,17 @@ def find_url(path: str | os.PathLike[str]) -> str | None:
 
 
 def given_name(path: str | os.PathLike[str]) -> str:
-    """Return the address that a path is, or the local path as it was given.
+    """Return the address that a path is, or the local path as it can be given to a command.
 
     Examples
     --------
     >>> given_name(Path("s3://bucket/log.zarr")), given_name(Path("log.csv"))
     ('s3://bucket/log.zarr', 'log.csv')
+    >>> given_name(Path("./-2.csv"))  # which pathlib makes -2.csv
+    './-2.csv'
     """
-    return find_url(path) or os.fspath(path)
+    name = find_url(path) or os.fspath(path)
+    return os.path.join(".", name) if name.startswith("-") else name
 
 
 def full_name(path: str | os.PathLike[str]) -> str:

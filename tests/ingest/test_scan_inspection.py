@@ -169,6 +169,15 @@ def test_readable_log_prints_its_table_and_the_next_command(
     assert call(*words, "--quiet-progress") == 0
 
 
+def test_a_name_that_begins_with_a_hyphen_is_not_an_option_of_the_command(
+    tmp_path: Path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "-2.csv", {"time [s]": TIME, "gyro_x [deg/s]": GX})
+    assert call("scan", "./-2.csv") == 0
+    assert call(*next_command(capsys.readouterr().err), "--quiet-progress") == 0
+
+
 def test_options_are_part_of_the_command_and_wrong_ones_exit_with_2(
     tmp_path: Path, monkeypatch, capsys
 ) -> None:
