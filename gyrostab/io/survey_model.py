@@ -28,7 +28,8 @@ class SurveyTerm:
         Standard deviation (1 sigma) of the error source [`unit`]; NaN if not observable.
     low, high : float
         The same from the 5 % and 95 % quantiles of the coefficients over the windows, or from the
-        95 % interval of a diagnosis [`unit`]; 0 and `value` for an upper limit.
+        95 % interval of a diagnosis [`unit`]. A coefficient that is an upper limit enters `low` as
+        0 and `high` as the limit.
     status : str
         ``observed``; ``upper_limit_only`` if the upper limit of a coefficient entered;
         ``not_observable`` if a coefficient has neither value nor limit.
