@@ -145,9 +145,9 @@ def test_run_prints_the_table_the_next_command_and_the_file(tmp_path, capsys):
     assert lines[-1] == str(target)
     assert re.search(r"^ +z +N +0\.0(09\d*|1\d*) ", shown.out, re.MULTILINE)
     assert "Misfit, median chi2/dof" in shown.out
-    command = next(line for line in lines if line.startswith("Next: "))
+    command = next(line for line in shown.err.splitlines() if line.startswith("next: "))
     import shlex
 
-    words = shlex.split(command.removeprefix("Next: "))
+    words = shlex.split(command.removeprefix("next: "))
     assert words[0] == "gyrostab"
     assert main(words[1:]) == 0

@@ -159,14 +159,15 @@ def _print_product(target: Path) -> None:
     from shlex import quote
 
     from gyrostab.allan.summary import format_product
+    from gyrostab.ingest.scan_output import print_next
     from gyrostab.io.opening import open_product
-    from gyrostab.store.remote import find_url
+    from gyrostab.store.remote import find_url, given_name
 
     with open_product(target) as product:
-        print(format_product(product))
-    url, page = find_url(target), target.with_suffix(".html")
-    name, page = (url, Path(page.name)) if url else (str(target), page)
-    print(f"\nNext: gyrostab report {quote(name)} -o {quote(str(page))}")
+        print(format_product(product), end="\n\n")
+    name, page = given_name(target), target.with_suffix(".html")
+    page = Path(page.name) if find_url(target) else page
+    print_next(f"gyrostab report {quote(name)} -o {quote(given_name(page))}", apart=True)
     print(name)
 
 
