@@ -139,8 +139,9 @@ def axis_names(dataset: xr.Dataset, axis: str | None = None) -> list[str]:
 
 
 def axis_style(dataset: xr.Dataset, axis: str) -> dict[str, Any]:
-    """Choose colour and marker of an axis: by its name for x, y and z, else by its place."""
-    number = "xyz".index(axis) if axis in ("x", "y", "z") else axis_names(dataset).index(axis)
+    """Choose colour and marker of an axis: by name if all are x, y or z, else by its place."""
+    names = axis_names(dataset)
+    number = ("xyz" if {*names} <= {*"xyz"} else names).index(axis)
     return {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number % len(MARKERS)]}
 
 

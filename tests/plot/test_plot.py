@@ -22,7 +22,7 @@ from gyrostab.noise import LAWS, model_avar
 from gyrostab.plot import plot_adev, plot_coefficients, plot_davar, plot_davar_3d, plot_signal
 from gyrostab.plot.correlation import _shift_driver
 from gyrostab.plot.signal import thin
-from gyrostab.plot.style import save_png
+from gyrostab.plot.style import COLOURS, axis_style, save_png
 from gyrostab.report.product import write_report
 from tests.support import synthetic
 from tests.support.repetitions import first_of
@@ -241,6 +241,13 @@ def test_standard_errors_are_drawn(product):
         + np.array([-1, 1]) * product.N_stderr.sel(axis="x").values[0]
     )
     np.testing.assert_allclose(sorted(segment[:, 1]), expected)
+
+
+@pytest.mark.parametrize(("names", "places"), [("ax", [0, 1]), ("xa", [0, 1]), ("zx", [2, 0])])
+def test_every_axis_has_another_colour(names, places):
+    axes = xr.Dataset(coords={"axis": list(names)})
+    colours = [axis_style(axes, name)["color"] for name in names]
+    assert colours == [COLOURS[place] for place in places]
 
 
 def test_coefficients_of_a_surface_are_refused():
