@@ -28,6 +28,7 @@ from gyrostab.plot.style import (
     write_in_middle,
 )
 from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY, check_surface, with_axis
+from gyrostab.time.grid import span_of
 from gyrostab.time.stamps import label_stamp
 
 if TYPE_CHECKING:
@@ -137,8 +138,8 @@ def _select_window(part: xr.Dataset, when: Any) -> int:
         )
         return int(best[np.argmin(np.abs(best - time.size // 2))])
     try:
-        stamp = np.datetime64(str(np.datetime64(when))).astype("datetime64[ns]")
-    except ValueError as error:
+        stamp, _ = span_of(when)
+    except (TypeError, ValueError) as error:
         raise OptionError(
             f"time {when!r} is not understood; write it as 2026-11-20T14:30:00"
         ) from error

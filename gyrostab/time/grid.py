@@ -174,15 +174,18 @@ class GridTransform(CoordinateTransform):
         return self.stamps_at([0, max(self.size - 1, 0)])
 
 
-def _span_of(bound: Any) -> tuple[np.datetime64, np.datetime64]:
+def span_of(bound: Any) -> tuple[np.datetime64, np.datetime64]:
     """Return the first and last nanosecond, UTC, of a time or of what a text names."""
     if isinstance(bound, str):  # "T12:00:03" ends with that second
         match = _OFFSET.fullmatch(bound.strip())
         period = pd.Period(match[1] if match else bound)
+        if pd.isna(period):
+            raise ValueError(f"{bound!r} is not a time")
         zone: Any = pd.Timestamp(f"1970-01-01T00:00{match[2] if match else 'Z'}").utcoffset()
         ends = period.start_time - zone, period.end_time - zone
     else:
-        time = pd.Timestamp(bound)
+        scalar: Any = np.asarray(bound)[()]  # also of a DataArray
+        time = pd.Timestamp(scalar)
         ends = (time.tz_convert(None) if time.tzinfo else time,) * 2
     first, last = (end.as_unit("ns").to_datetime64() for end in ends)
     return first, last
@@ -265,12 +268,12 @@ class TimeGridIndex(CoordinateTransformIndex):
         if isinstance(label, slice):
             return _wrap_positions({dim: self._find_slice(label)})
         if isinstance(label, str) and method is None:
-            first, last = _span_of(label)
+            first, last = span_of(label)
             if last - first > np.timedelta64(1, "s"):
                 # "2026-11-20" or "2026-11-20T14": the whole day or hour, as in pandas
                 return _wrap_positions({dim: self._find_slice(slice(first, last))})
         if isinstance(label, str | date):  # also a pandas.Timestamp
-            times: NDArray[Any] = np.asarray(_span_of(label)[0])
+            times: NDArray[Any] = np.asarray(span_of(label)[0])
         else:
             times = np.asarray(getattr(label, "values", label))
         if times.dtype.kind == "b":
@@ -319,7 +322,7 @@ class TimeGridIndex(CoordinateTransformIndex):
         def edge(bound: Any, side: str) -> int | None:
             if bound is None:
                 return None
-            stamp = _span_of(bound)[0 if side == "left" else 1]
+            stamp = span_of(bound)[0 if side == "left" else 1]
             guess = int(np.clip(self.transform.find_positions(stamp), 1, size + 1)) - 1
             while guess < size:  # at most three steps: only rounding is missing
                 grid_stamp = self.transform.stamps_at(guess).view("datetime64[ns]")

@@ -703,8 +703,9 @@ def test_wrong_arguments_are_explained():
         fit_noise(surface.drop_vars("avar"))
     with pytest.raises(SchemaError, match="white_response"):
         fit_noise(surface.drop_vars("white_response"))
-    with pytest.raises(OptionError, match="between 0 and 1"):
-        confidence_interval(surface, level=95)
+    for level in (95, "0.9"):
+        with pytest.raises(OptionError, match="between 0 and 1"):
+            confidence_interval(surface, level=level)
 
 
 @pytest.mark.parametrize("kind", ["rate", "angle"])

@@ -6,6 +6,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from hypothesis import given
@@ -307,6 +308,14 @@ def test_adev_draws_the_requested_window(product):
     assert f"centred on {str(when)[:23].replace('T', ' ')} UTC" in figure.get_suptitle()
 
 
+def test_adev_takes_a_time_of_any_type(product):
+    title = plot_adev(product, "y", when=product.time.values[7]).get_suptitle()
+    stamp = product.time[7]
+    zoned = pd.Timestamp(stamp.values, tz="UTC").tz_convert("America/Chicago")
+    for when in (stamp, zoned, zoned.floor("us").to_pydatetime(), str(zoned)):
+        assert plot_adev(product, "y", when=when).get_suptitle() == title
+
+
 def test_adev_without_a_time_avoids_the_gap(product):
     ax = plot_adev(product, "x").axes[0]
     assert np.isfinite(ax.lines[0].get_ydata()).any()
@@ -317,6 +326,8 @@ def test_adev_without_a_time_avoids_the_gap(product):
     [
         ("2031-01-01", "outside the record"),
         ("noon", "not understood"),
+        ("NaT", "not understood"),
+        ([1, 2], "not understood"),
     ],
 )
 def test_adev_refuses_an_impossible_time(product, when, words):
