@@ -178,8 +178,8 @@ def span_of(bound: Any) -> tuple[np.datetime64, np.datetime64]:
     """Return the first and last nanosecond, UTC, of a time or of what a text names."""
     if isinstance(bound, str):  # "T12:00:03" ends with that second
         match = _OFFSET.fullmatch(bound.strip())
-        period = pd.Period(match[1] if match else bound)
-        if pd.isna(period):
+        period: Any = pd.Period(match[1] if match else bound)
+        if period is pd.NaT:
             raise ValueError(f"{bound!r} is not a time")
         zone: Any = pd.Timestamp(f"1970-01-01T00:00{match[2] if match else 'Z'}").utcoffset()
         ends = period.start_time - zone, period.end_time - zone
