@@ -58,6 +58,7 @@ from gyrostab.jobs.fleet_table import (
 )
 from gyrostab.jobs.job import (
     check_job_folder,
+    check_unfinished_run,
     job_folder,
     lock_job,
     make_fingerprint,
@@ -189,6 +190,9 @@ def run_fleet(
         At the end, when a run has failed.
     WorkerError, KeyboardInterrupt
         When the workers fail, or at an interruption; the message says how much is done.
+    ResumeError
+        When there is an unfinished run of the output without `overwrite`, or another process works
+        on it.
     OutputError, OptionError
         When the output or an option is wrong, or the output has results of other files or options.
     """
@@ -201,6 +205,8 @@ def run_fleet(
     target = resolve_link(output)
     check_job_folder(job_folder(target))
     with protect_inputs(paths), lock_job(job_folder(target)):
+        if not overwrite:
+            check_unfinished_run(job_folder(target), output=target)
         try:
             archive, known_table = open_archive(paths, target)
             given_options = {**make_fingerprint([], options)["options"], "per": per}

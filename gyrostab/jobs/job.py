@@ -301,6 +301,16 @@ def _list_names(folder: Path) -> list[str]:
         return []
 
 
+def check_unfinished_run(folder: Path, *, output: Path) -> None:
+    """Raise `ResumeError` when another command would remove the finished parts of a run."""
+    if (job := read_job(folder)) and has_finished_work(folder):
+        raise ResumeError(
+            f"{output}: a run of it was begun and not finished; "
+            f"{count_finished_parts(folder)} of {job['parts']} parts are kept, and gyrostab run "
+            "with --resume continues it; give another name with -o, or --overwrite to discard them"
+        )
+
+
 def clear_job(folder: Path) -> None:
     """Remove everything from a job folder but the lock."""
     (folder / "job.json").unlink(missing_ok=True)

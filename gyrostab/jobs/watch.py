@@ -31,6 +31,8 @@ from gyrostab.jobs.alarms import Alarm, check_alarms, describe_windows
 from gyrostab.jobs.engine import compute_part, find_record_bands
 from gyrostab.jobs.follow import FileMemory, FileStates, RowKeeper, hash_samples, list_files
 from gyrostab.jobs.job import (
+    check_job_folder,
+    check_unfinished_run,
     describe_differences,
     job_folder,
     lock_job,
@@ -132,6 +134,9 @@ def watch(
     OutputError
         When the output exists and is not that of the same source, its files and options, or cannot
         be written.
+    ResumeError
+        When there is an unfinished run of the output without `overwrite`, or another process works
+        on it.
     OptionError, UnitError
         When an option or the unit of a column is wrong or missing.
     FormatError
@@ -149,7 +154,10 @@ def watch(
         place = str(rows_folder(path)) if source == "-" else source
         until = _continue_product(path, place, identity, overwrite=overwrite)
         folder = job_folder(resolve_link(path))
+        check_job_folder(folder)
         with lock_job(folder):
+            if not overwrite:
+                check_unfinished_run(folder, output=path)
             try:
                 keeper = None
                 if source == "-":

@@ -19,12 +19,14 @@ import xarray as xr
 
 from gyrostab import make_log, open_log, open_product, to_netcdf, to_zarr
 from gyrostab.cli import main
-from gyrostab.errors import FormatError, OptionError, OutputError
+from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError
 from gyrostab.ingest.files import scan_file
 from gyrostab.jobs import fleet as fleet_module
 from gyrostab.jobs.archive import Archive, LogRun, find_archive, find_runs
 from gyrostab.jobs.fleet import process_run, run_fleet, write_file_table
 from gyrostab.jobs.fleet_table import TREND_COLUMNS, read_table, write_table
+from gyrostab.jobs.job import begin_job, job_folder, make_fingerprint
+from gyrostab.jobs.load import check_options
 from gyrostab.jobs.run import run
 from gyrostab.jobs.schedule import open_pool
 from gyrostab.report.fleet import write_overview
@@ -397,6 +399,19 @@ def test_nothing_foreign_is_replaced(archive, tmp_path):
     with pytest.raises(OutputError, match=r"notes\.txt.*gyrostab did not make"):
         run_fleet([archive], output, overwrite=True)
     assert [path.name for path in output.iterdir()] == ["notes.txt"]
+
+
+def test_finished_parts_of_a_run_are_kept(tmp_path):
+    write_log(tmp_path / "in" / "r1.nc", 6)
+    output = tmp_path / "out.zarr"
+    folder = job_folder(output)
+    folder.mkdir()
+    begin_job(folder, make_fingerprint([], check_options()), parts=5, overwrite=False)
+    (folder / "windows-0000000000.block").write_bytes(b"an hour of work")
+    with pytest.raises(ResumeError, match=r"out\.zarr: a run of it.*1 of 5 parts.*--resume"):
+        run_fleet([tmp_path / "in"], output, **OPTIONS)
+    assert (folder / "windows-0000000000.block").read_bytes() == b"an hour of work"
+    assert not output.exists()
 
 
 @pytest.fixture

@@ -18,13 +18,14 @@ import numpy as np
 import pytest
 
 from gyrostab.cli import main
-from gyrostab.errors import FormatError, OptionError, OutputError
+from gyrostab.errors import FormatError, OptionError, OutputError, ResumeError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import to_netcdf, to_zarr
 from gyrostab.io.opening import open_product
 from gyrostab.jobs import follow as follow_module
 from gyrostab.jobs import watch as module
 from gyrostab.jobs.alarms import check_alarms, parse_alarm
+from gyrostab.jobs.job import begin_job, job_folder, make_fingerprint
 from gyrostab.jobs.live_page import LivePage
 from gyrostab.jobs.load import check_options
 from gyrostab.jobs.run import run
@@ -324,6 +325,25 @@ def test_other_options_and_foreign_outputs_are_refused(tmp_path):
     with pytest.raises(OptionError, match=r"must end in \.zarr"):
         follow(source, tmp_path / "a.nc")
     assert not list(tmp_path.glob(".*"))
+
+
+def test_finished_parts_of_a_run_and_foreign_files_are_kept(tmp_path):
+    source, output = tmp_path / "log.csv", tmp_path / "a.zarr"
+    source.write_text(HEADER + "".join(make_rows(3_000)))
+    folder = job_folder(output)
+    folder.mkdir()
+    (folder / "thesis.txt").write_text("mine")
+    with pytest.raises(OutputError, match=r"thesis\.txt: .*gyrostab did not make what is there"):
+        follow(source, output)
+    assert [path.name for path in folder.iterdir()] == ["thesis.txt"]
+    (folder / "thesis.txt").unlink()
+    begin_job(folder, make_fingerprint([], check_options()), parts=5, overwrite=False)
+    (folder / "windows-0000000000.block").write_bytes(b"an hour of work")
+    with pytest.raises(ResumeError, match=r"a\.zarr: a run of it.*1 of 5 parts.*--resume"):
+        follow(source, output)
+    assert (folder / "windows-0000000000.block").read_bytes() == b"an hour of work"
+    follow(source, output, overwrite=True)
+    assert not folder.exists()
 
 
 def test_a_product_of_another_source_or_of_files_that_are_gone_is_refused(tmp_path):
