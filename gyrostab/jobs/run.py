@@ -210,10 +210,12 @@ def _describe_job(
     from gyrostab.ingest.formats.binary import list_layouts
 
     extra = options["reading"].get("channel", ())
-    files = expand(paths) + (expand(extra) if extra else [])
+    channel_files = expand(extra) if extra else []
+    files = expand(paths) + channel_files
     files += list_layouts(files)
+    names = [path.name for path in channel_files] or None  # without folders, as in the hash
     fingerprint = make_fingerprint(
-        files, {**options, "reading": {**options["reading"], "channel": None}}
+        files, {**options, "reading": {**options["reading"], "channel": names}}
     )
     name = hash_fingerprint(fingerprint)
     return _Job(target, job_folder(target), files, fingerprint, name, options, zarr)

@@ -310,6 +310,29 @@ def test_changes_refuse_to_resume_and_say_what(log, tmp_path, after_two, monkeyp
     assert call(own, "-o", output, "--resume") == 0
 
 
+def test_a_log_is_not_mistaken_for_a_file_of_channels(tmp_path, capfd):
+    log, probe, output = tmp_path / "a.csv", tmp_path / "probe.csv", tmp_path / "q.nc"
+    values = np.random.default_rng(7).standard_normal(3_000)
+    rows = "".join(f"{i / 50:.2f},{value:.3f}\n" for i, value in enumerate(values.tolist()))
+    log.write_text("time [s],gyro_x [deg/h]\n" + rows)
+    probe.write_text(
+        "time [s],gyro_x [deg/h],temperature [degC]\n"
+        + "".join(f"{i + 60:.2f},0.5,{20 + i}\n" for i in range(60))
+    )
+    windows = ["-o", str(output), "--window", "10s", "--step", "10s"]
+    assert main(["run", str(log), str(probe), *windows]) == 0
+    before = output.read_bytes()
+    capfd.readouterr()
+    with_channel = ["run", str(log), "--channel", str(probe), *windows]
+    assert main([*with_channel, "--resume"]) == 2
+    assert "is not the product of these logs and options" in one_message(capfd.readouterr())
+    assert output.read_bytes() == before
+    assert main([*with_channel, "--overwrite"]) == 0
+    capfd.readouterr()
+    assert main([*with_channel, "--resume"]) == 0
+    assert "complete already" in capfd.readouterr().err
+
+
 def test_a_zarr_store_with_a_changed_chunk_is_noticed(log, tmp_path):
     from gyrostab import to_zarr
     from gyrostab.jobs.job import describe_differences, make_fingerprint
