@@ -57,6 +57,8 @@ _MEMORY_ORDER = ("axis", ..., "tau", "term", "bnds")
 _LONG_NAMES = {**SIGNAL_LONG_NAMES, "axis": VARIABLES["axis"]["long_name"]}
 #: What the encoding of integer counts consists of, where a reader declares them.
 PACKING = ("dtype", "scale_factor", "add_offset")
+#: Attributes by which readers decode stored numbers; numbers in memory are decoded.
+_DECODING = {"_FillValue", "missing_value", "_Unsigned", "scale_factor", "add_offset"}
 
 
 def find_kind(dataset: xr.Dataset) -> str:
@@ -89,16 +91,17 @@ def to_disk(
     ]
     variables: dict[Any, xr.Variable] = {}
     for name, variable in dataset.variables.items():
+        known_attrs = {key: item for key, item in variable.attrs.items() if key not in _DECODING}
         if name in grids:
             encode = encode_all_stamps if stamps else encode_first_stamp
             variables[name if stamps else f"{name}_start"] = encode(
-                grids[name], variable.attrs, divisor
+                grids[name], known_attrs, divisor
             )
             continue
         is_index = name in dataset.dims
         stored = variable if is_index else transpose_lazy(_make_lazy(variable), _DISK_ORDER)
         label = _LONG_NAMES.get(str(name), str(name).replace("_", " "))
-        attrs = encode_attributes({"long_name": label, **variable.attrs})
+        attrs = encode_attributes({"long_name": label, **known_attrs})
         data = variable.values if is_index else stored.data
         if variable.dtype.kind == "M":
             data = encode_stamps(name, stored, divisor)

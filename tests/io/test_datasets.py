@@ -13,11 +13,13 @@ import h5py
 import hypothesis.extra.numpy as hnp
 import netCDF4
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from gyrostab import from_dataarray
 from gyrostab.errors import FormatError, OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.io import datasets as export
@@ -533,6 +535,28 @@ def test_lazy_numbers_and_arrays_in_attributes_can_be_written(tmp_path, write):
     with open_log(write(log, tmp_path / "log")) as back:
         assert float(back["mean"]) == float(log["mean"])
         np.testing.assert_array_equal(back.rate.attrs["valid_range"], [-1e5, 1e5])
+
+
+@pytest.mark.parametrize("write", [to_netcdf, to_zarr])
+def test_attributes_of_a_packed_variable_do_not_change_its_numbers(tmp_path, write):
+    """As where netCDF4 has scaled the values, and its attributes are copied."""
+    packing = {
+        "scale_factor": 0.01, "add_offset": 3.0, "_FillValue": 5, "missing_value": 5.0,
+        "_Unsigned": "true",
+    }  # fmt: skip
+    time = pd.date_range("2026-01-01", periods=4, freq="10ms")
+    coords = {"time": ("time", time, packing)}
+    data = xr.DataArray([1.0, 5.0, -2.0, 4.0], coords, dims="time")
+    log = from_dataarray(data.assign_attrs(units="deg/h", comment="raw", **packing))
+    log["temperature"] = ("time", [20.0, 5.0, 21.0, 5.0], {"units": "degree_Celsius", **packing})
+    path = write(log, tmp_path / ("log.nc" if write is to_netcdf else "log.zarr"))
+    engine = "netcdf4" if write is to_netcdf else "zarr"
+    with xr.open_dataset(path, engine=engine) as plain, open_log(path) as back:
+        for opened in (plain, back):
+            np.testing.assert_array_equal(opened["rate"].values, [[1.0, 5.0, -2.0, 4.0]])
+            np.testing.assert_array_equal(opened["temperature"].values, [20.0, 5.0, 21.0, 5.0])
+            np.testing.assert_array_equal(opened["time"].values, time)
+        assert back["rate"].attrs["comment"] == "raw"
 
 
 @pytest.mark.parametrize("write", [to_netcdf, to_zarr])
