@@ -1,4 +1,6 @@
-"""Checks for damage with which a library would end the process or never return.
+"""Checks for content with which a library would run code, end the process or never return.
+
+A Zarr store names the codecs of its chunks. Those that restore objects of Python can run code.
 
 A Blosc chunk of a Zarr store states its length in bytes 12 to 16. numcodecs does not compare it
 with the bytes that it is given (seen in 0.16) and reads beyond the end of a chunk that was cut
@@ -19,7 +21,7 @@ from __future__ import annotations
 import json
 import os
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -27,6 +29,13 @@ from typing import Any, BinaryIO
 from gyrostab.errors import FormatError
 from gyrostab.store.output.content import METADATA, UNFINISHED
 
+#: Codecs of Zarr format 2 that only restore numbers or text; format 3 has no others.
+_HARMLESS_CODECS = {
+    *("blosc", "bz2", "gzip", "lz4", "lzma", "packbits", "zlib", "zstd"),
+    *("astype", "bitround", "delta", "fixedscaleoffset", "quantize", "shuffle"),
+    *("adler32", "crc32", "crc32c", "fletcher32", "jenkins_lookup3"),
+    *("vlen-bytes", "vlen-utf8"),
+}
 _HEADER_BYTES = 16  # of a Blosc chunk
 
 _SUPERBLOCK = b"\x89HDF\r\n\x1a\n"
@@ -37,6 +46,27 @@ _OBJECT = struct.Struct("<HHIQ")  # number, references, reserved, bytes
 _SEARCHED_BYTES = 128 << 20
 _BLOCK_BYTES = 1 << 20
 _MAX_OBJECTS = 1 << 16  # their numbers have 16 bits
+
+
+def check_codecs(where: str, variables: Mapping[Any, Any]) -> None:
+    """Raise `FormatError` when a variable of a Zarr store has a codec that may run code.
+
+    The variables are those of xarray, of which no chunk has been read; `where` names the store.
+    """
+    for name, variable in variables.items():
+        codecs = [
+            codec
+            for kind in ("compressors", "filters")
+            for codec in variable.encoding.get(kind) or ()
+        ]
+        for codec in codecs:
+            identifier = getattr(codec, "codec_id", None)  # None in format 3
+            if identifier is not None and identifier not in _HARMLESS_CODECS:
+                raise FormatError(
+                    f"{where}: {name} is stored with the codec {identifier!r}, and gyrostab reads "
+                    "only codecs that hold nothing but numbers or text; ask for the store with "
+                    "another compressor, such as Blosc"
+                )
 
 
 def is_blosc_cut(header: bytes, size: int) -> bool:

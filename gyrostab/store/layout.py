@@ -97,7 +97,9 @@ def is_readable(path: Path, name: str) -> bool:
             codecs = find_hdf5_codecs(file[name].id.get_create_plist())
         return not any(isinstance(codec, _UnknownFilter) for _, codec in codecs)
     try:
-        return bool(json.loads((path / name / ".zarray").read_bytes())["order"] == "C")
+        layout = json.loads((path / name / ".zarray").read_bytes())
+        codecs = find_zarr_codecs(layout)
+        return layout["order"] == "C" and not any(isinstance(c, _UnknownFilter) for c in codecs)
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -193,7 +195,7 @@ def find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
     codecs: list[tuple[int, Any]] = []
     for number in reversed(range(plist.get_nfilters())):
         code, _, values, _ = plist.get_filter(number)
-        codec: Any = _UnknownFilter(code)
+        codec: Any = _UnknownFilter(f"filter {code} of HDF5")
         if code == _SHUFFLE:
             codec = _Shuffle(values[0])
         elif code == _DEFLATE:
@@ -263,10 +265,10 @@ class _Blosc:
 
 @dataclass(frozen=True)
 class _UnknownFilter:
-    code: int
+    name: str
 
     def decode(self, data: bytes) -> bytes:
-        raise ChunkDamage(f"cannot be read: gyrostab does not support filter {self.code} of HDF5")
+        raise ChunkDamage(f"cannot be read: gyrostab does not support {self.name}")
 
 
 def _read_zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray[Any]:
@@ -308,15 +310,17 @@ def _read_zarr_layout(folder: Path, opened: str) -> _ZarrLayout:
 
 
 def find_zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
-    """Find the codecs of a variable, in the order of reading."""
-    import numcodecs
+    """Make the codecs of a variable, in the order of reading."""
+    from numcodecs import Zlib, Zstd
 
-    known_codecs = {"fletcher32": _Fletcher32, "blosc": _Blosc}
+    known_codecs = {"blosc": _Blosc, "fletcher32": _Fletcher32, "zlib": Zlib, "zstd": Zstd}
     described = [
         item for item in [layout["compressor"], *reversed(layout["filters"] or ())] if item
     ]
     return tuple(
-        known_codecs[item["id"]]() if item["id"] in known_codecs else numcodecs.get_codec(item)
+        known_codecs[item["id"]]()
+        if item["id"] in known_codecs
+        else _UnknownFilter(f"codec {item['id']!r} of Zarr")
         for item in described
     )
 

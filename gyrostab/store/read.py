@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from gyrostab.errors import DamageError, FormatError, reading_of
 from gyrostab.kernels.encoding.counts import from_counts
-from gyrostab.store.damage import check_blosc_chunks, check_global_heaps
+from gyrostab.store.damage import check_blosc_chunks, check_codecs, check_global_heaps
 from gyrostab.store.layout import ChunkCache, ChunkDamage, is_readable, read_chunk
 from gyrostab.store.lazy import FileVariable, RowSource, make_dask
 from gyrostab.store.private import close_function
@@ -80,6 +80,7 @@ def _open_remote(path: Path, url: str) -> xr.Dataset:
     with reaching(url), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # without consolidated metadata
         stored = xr.open_dataset(url.rstrip("/"), engine="zarr", **_AS_STORED)
+        check_codecs(url, stored.variables)
         return _make_variables_lazy(replace_stamps(stored, path), {}, path)
 
 
@@ -107,6 +108,7 @@ def _open_dataset(
         raise DamageError(
             f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again"
         ) from error
+    check_codecs(str(path), stored.variables)
     if check is not None:
         check(path, stored.variables)
     is_log = stored.attrs.get("gyrostab_content") == "log"

@@ -42,7 +42,7 @@ from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
 from gyrostab.store.attributes import read_attribute
 from gyrostab.store.cf import from_disk
-from gyrostab.store.damage import check_blosc_chunks, check_global_heaps
+from gyrostab.store.damage import check_blosc_chunks, check_codecs, check_global_heaps
 from gyrostab.store.read import open_stored
 from gyrostab.store.remote import find_url
 from gyrostab.store.times import decode_stamps
@@ -174,6 +174,7 @@ def _open_undecoded(path: Path) -> Iterator[xr.Dataset]:
             "_ARRAY_DIMENSIONS (Zarr format 2) or dimension_names (format 3)"
         ) from error
     with stored:
+        check_codecs(path.name, stored.variables)
         yield stored
 
 
