@@ -285,11 +285,11 @@ def _compute_runs(
         )
         waiting = [item for item, is_done in zip(runs, is_current, strict=True) if not is_done]
     waiting.sort(key=lambda item: -item.bytes)  # a long run at the end would leave workers idle
-    stale = {item.name for item in waiting}
+    left_out = {item.name for item in waiting} | _find_renamed(old_rows, runs)
     rows = {
         name: row
         for name, row in old_rows.items()
-        if name not in stale and _has_product(target, name)
+        if name not in left_out and _has_product(target, name)
     }
     work = partial(
         process_run, full_name(target), json.dumps(options, default=str), reports, overwrite
@@ -319,6 +319,17 @@ def _compute_runs(
         if is_zarr(target):
             consolidate_metadata(target, list(rows))
     return table
+
+
+def _find_renamed(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) -> set[str]:
+    """Find rows of an earlier call whose logs belong to runs of other names now."""
+    names = {item.name for item in runs}
+    logs = {full_name(path) for item in runs for path in item.files}
+    return {
+        name
+        for name, row in rows.items()
+        if name not in names and not logs.isdisjoint(json.loads(row.get("logs") or "[]"))
+    }
 
 
 def _is_current(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -194,8 +195,11 @@ def read_rows(target: Path) -> dict[str, dict[str, Any]]:
 
 
 def make_table(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) -> pd.DataFrame:
-    """Make the table of runs, with the verdicts of their diagnoses and their present tools."""
-    tools = {item.name: {"tool": item.tool} for item in runs}
+    """Make the table of runs, with their present tools and logs and the verdicts of diagnoses."""
+    present = {
+        item.name: {"tool": item.tool, "logs": json.dumps([full_name(path) for path in item.files])}
+        for item in runs
+    }
     diagnosed = {
         item.name: (item.verdict, full_name(item.diagnosis)) for item in runs if item.diagnosis
     }
@@ -205,7 +209,7 @@ def make_table(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) ->
             {
                 **dict.fromkeys(first),
                 **rows[name],
-                **tools.get(name, {}),
+                **present.get(name, {}),
                 **dict(zip(("verdict", "diagnosis"), diagnosed.get(name, ("", "")), strict=True)),
             }
             for name in sorted(rows)

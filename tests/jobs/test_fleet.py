@@ -275,6 +275,19 @@ def test_results_of_other_files_or_options_are_replaced_with_overwrite_only(tmp_
     assert list(table["span [s]"]) == [360.0]
 
 
+def test_a_run_under_another_name_has_one_row(tmp_path):
+    archive, output = tmp_path / "archive", tmp_path / "fleet"
+    for name in ("r1", "r2", "gone"):
+        write_log(archive / "SN7" / name / "log.nc", 5)
+    assert list(run_fleet([archive / "SN7"], output, **OPTIONS)["run"]) == ["gone", "r1", "r2"]
+    (archive / "SN7" / "gone" / "log.nc").unlink()
+    write_log(archive / "SN7" / "r1" / "more.nc", 6, start="2026-05-01T00:05:00")
+    table = run_fleet([archive], output, **OPTIONS)
+    assert list(table["run"]) == ["SN7/r1", "SN7/r2", "gone"]
+    assert list(table["span [s]"]) == [600.0, 300.0, 300.0]
+    assert list(run_fleet([archive], output, **OPTIONS)["run"]) == list(table["run"])
+
+
 def test_runs_that_failed_are_computed_with_other_options(tmp_path):
     archive, output = tmp_path / "archive", tmp_path / "fleet"
     write_log(archive / "run" / "log.nc", 5)
