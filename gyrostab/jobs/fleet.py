@@ -168,8 +168,8 @@ def run_fleet(
     reports : bool
         Whether each run gets a report.
     overwrite : bool
-        Compute all runs again, also with other options or for another archive, whose runs replace
-        those of the same names.
+        Compute all runs again, also with other options or for another archive. The table then has
+        the runs of this call only.
     scheduler : str
         ``processes``, the address of a dask.distributed scheduler, whose workers must see the
         archive and the output under the same names, or ``threads``: one run after the other in this
@@ -289,7 +289,7 @@ def _compute_runs(
     rows = {
         name: row
         for name, row in old_rows.items()
-        if name not in left_out and _has_product(target, name)
+        if not overwrite and name not in left_out and _has_product(target, name)
     }
     work = partial(
         process_run, full_name(target), json.dumps(options, default=str), reports, overwrite

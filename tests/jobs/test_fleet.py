@@ -288,6 +288,18 @@ def test_a_run_under_another_name_has_one_row(tmp_path):
     assert list(run_fleet([archive], output, **OPTIONS)["run"]) == list(table["run"])
 
 
+def test_a_table_of_other_options_has_no_rows_of_the_earlier_ones(tmp_path):
+    archive, output = tmp_path / "archive", tmp_path / "fleet"
+    for name in ("r1", "r2"):
+        write_log(archive / name / "log.nc", 5)
+    run_fleet([archive], output, **OPTIONS)
+    (archive / "r1" / "log.nc").unlink()
+    others = {**OPTIONS, "windows": {**WINDOWS, "step": "1min"}}
+    table = run_fleet([archive], output, **others, overwrite=True)
+    assert list(table["run"]) == ["r2"]
+    assert (output / "r1.nc").exists()
+
+
 def test_runs_that_failed_are_computed_with_other_options(tmp_path):
     archive, output = tmp_path / "archive", tmp_path / "fleet"
     write_log(archive / "run" / "log.nc", 5)
