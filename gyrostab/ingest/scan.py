@@ -26,7 +26,7 @@ from gyrostab.ingest.inspect import FileInspection, inspect_file
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.ingest.reading import read_log
 from gyrostab.ingest.uniform import cut_log
-from gyrostab.schema import log_channels, signal_name, texts
+from gyrostab.schema import escape_text, log_channels, signal_name, texts
 from gyrostab.store.remote import given_name
 from gyrostab.units import HOUR
 
@@ -150,6 +150,8 @@ def scan_and_inspect(
                 if inspected_file.paths == [path]:
                     row["rows"] = inspected_file.inspection.rows
             rows.append(row)
+    for row in rows:
+        row |= {key: escape_text(value) for key, value in row.items() if isinstance(value, str)}
     return ScanResult(
         pd.DataFrame(rows, columns=list(COLUMNS)),
         errors,

@@ -22,6 +22,7 @@ from gyrostab.ingest.formats.binary import list_layouts
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.jobs.schedule import Pool, run_calls
 from gyrostab.progress import Stage
+from gyrostab.schema import escape_text
 from gyrostab.store.output import describe_file, read_json
 from gyrostab.store.output.content import METADATA, is_store
 from gyrostab.store.remote import (
@@ -201,9 +202,10 @@ def index_files(
     for path in [*archive.files, *archive.diagnoses]:
         state = describe_file(path)
         layouts = [describe_file(layout)["changed_ns"] for layout in list_layouts([path])]
+        name = full_name(path)
         row = {
-            "file": full_name(path),
-            "base": str(archive.base),
+            "file": escape_text(name),
+            "base": escape_text(str(archive.base)),
             "bytes": state["bytes"],
             "changed_ns": max([state["changed_ns"], *layouts]),
             "listing": state.get("listing", ""),
@@ -212,9 +214,15 @@ def index_files(
         old = old_rows.get(row["file"], {})
         is_same = all(old.get(key) == value for key, value in row.items())
         rows[row["file"]] = old if is_same else row
-        if not is_same:
-            changed.append(row["file"])
-    diagnosed = {full_name(path) for path in archive.diagnoses}
+        if row["file"] != name:
+            rows[row["file"]] |= {
+                "is_log": False,
+                "format": None,
+                "note": "its name is not UTF-8, as a table needs; rename the file or its folder",
+            }
+        elif not is_same:
+            changed.append(name)
+    diagnosed = {full_name(path) for path in archive.diagnoses}.intersection(rows)
     for name in diagnosed:
         rows[name] |= {"is_log": False, "format": DIAGNOSIS, "note": ""}
     names = [name for name in changed if name not in diagnosed]

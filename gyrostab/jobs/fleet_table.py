@@ -21,7 +21,7 @@ from gyrostab.jobs.archive import (
     read_diagnosis,
 )
 from gyrostab.noise import LAWS
-from gyrostab.schema import texts
+from gyrostab.schema import escape_text, texts
 from gyrostab.store.output import new_output
 from gyrostab.store.remote import full_name, read_bytes, upload_file
 from gyrostab.units import DAY, INNER
@@ -201,7 +201,9 @@ def make_table(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) ->
         for item in runs
     }
     diagnosed = {
-        item.name: (item.verdict, full_name(item.diagnosis)) for item in runs if item.diagnosis
+        item.name: (item.verdict, escape_text(full_name(item.diagnosis)))
+        for item in runs
+        if item.diagnosis
     }
     first = ("run", "tool", "error", "files", "start", "end", "span [s]", "rate [Hz]", "windows")
     return pd.DataFrame(

@@ -41,7 +41,7 @@ from gyrostab.jobs.job import (
 )
 from gyrostab.jobs.load import check_options, load_log
 from gyrostab.kernels.workspace import Workspace
-from gyrostab.schema import log_channels, signal_name, texts
+from gyrostab.schema import escape_text, log_channels, signal_name, texts
 from gyrostab.store.lazy import find_source
 from gyrostab.store.output import check_output, follow_inputs, resolve_link
 from gyrostab.store.remote import find_url, full_name
@@ -221,7 +221,7 @@ def _continue_product(
         check_output(path, suffixes=[".zarr"], overwrite=overwrite)
         return None
     check_output(path, suffixes=[".zarr"], overwrite=True)
-    present = {file.name for file in list_files(place)}
+    present = {escape_text(file.name) for file in list_files(place)}
     gone = next((name for name in names if name not in present), None)
     changes = describe_differences(json.loads(before), identity)
     if gone and not changes:

@@ -39,10 +39,21 @@ def signal_name(log: xr.Dataset) -> str:
     return signals[0]
 
 
+def escape_text(text: str) -> str:
+    r"""Escape what UTF-8 cannot hold: bytes of file names in another encoding.
+
+    Examples
+    --------
+    >>> print(escape_text("run\udcff.csv"))
+    run\udcff.csv
+    """
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
 def texts(dataset: xr.Dataset, name: str) -> list[str]:
     """Return the texts of an attribute such as ``notes`` or ``source_files`` as a list.
 
-    A single text may be stored without a list.
+    A single text may be stored without a list. All can be written as UTF-8.
 
     Examples
     --------
@@ -50,7 +61,7 @@ def texts(dataset: xr.Dataset, name: str) -> list[str]:
     (['one'], [])
     """
     held = dataset.attrs.get(name, ())
-    return [held] if isinstance(held, str) else [str(text) for text in held]
+    return [escape_text(str(text)) for text in ([held] if isinstance(held, str) else held)]
 
 
 def name_axes(signal: Any) -> list[str]:

@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.kernels.allan.variances import VARIANCES
-from gyrostab.schema import texts
+from gyrostab.schema import escape_text, texts
 from gyrostab.store.damage import check_global_heaps
 from gyrostab.store.output.content import read_json
 from gyrostab.store.private import library_lock
@@ -61,6 +61,8 @@ def encode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
     for name, value in attrs.items():
         if isinstance(value, np.generic):
             attrs[name] = value = value.item()
+        if isinstance(value, str):
+            attrs[name] = escape_text(value)
         if isinstance(value, bool) or not isinstance(value, str | int | float | np.ndarray):
             # in ASCII: Octave cannot list a file with other characters in a global attribute
             attrs[name] = json.dumps(value, default=str)

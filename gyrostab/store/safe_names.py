@@ -67,10 +67,8 @@ def make_names_storable(dataset: xr.Dataset) -> xr.Dataset:
         return dataset
     renamed = _rename_with_times(dataset, safe, used_names)
     for name, safe_name in safe.items():
-        # a name that was decoded wrongly may hold half a character
-        shown = name.encode("utf-8", "backslashreplace").decode()
         renamed[safe_name].attrs = {
-            "long_name": shown,
+            "long_name": name,
             **renamed[safe_name].attrs,
             ORIGINAL_NAME: json.dumps(name),
         }

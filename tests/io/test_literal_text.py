@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from gyrostab import correlate, davar, fit_noise, make_log, open_log, plot, to_netcdf, to_zarr
+from gyrostab import (
+    correlate,
+    davar,
+    fit_noise,
+    make_log,
+    open_log,
+    open_product,
+    plot,
+    to_netcdf,
+    to_zarr,
+)
 from gyrostab.plot.figures import product_figures
 from gyrostab.plot.style import draws_figure, new_figure, save_png
 from gyrostab.report import write_report
@@ -120,3 +132,24 @@ def test_a_name_that_no_file_can_hold_goes_all_the_way(tmp_path, capfd):
     assert "'<svg_onload=x>' as 'svg_onload_x'" in capfd.readouterr().err
     options = ["--with", "<svg_onload=x>", "--max-lag", "5s", "--quiet-progress"]
     assert call("correlate", tmp_path / "product.nc", *options) == 0
+
+
+def test_file_names_that_are_not_utf8_go_all_the_way(tmp_path, capfd):
+    """As of loggers that write Latin-1; ``surrogateescape`` is how Python holds such bytes."""
+    log = write_log(tmp_path / os.fsdecode(b"m\xe4rz.csv"))
+    probe = tmp_path / os.fsdecode(b"f\xfchler.csv")
+    probe.write_text("time [s],temperature [degC]\n0,20\n30,21\n60,22\n")
+    product = tmp_path / "product.nc"
+    assert call("scan", log) == 0
+    assert call("run", log, "--channel", probe, "-o", product, *WINDOW, "--quiet-progress") == 0
+    for name, form in (
+        ("imu.yaml", "kalibr"),
+        ("tool.csv", "iscwsa"),
+        ("tool.json", "iscwsa"),
+        ("tool.xml", "iscwsa"),
+    ):
+        assert call("export", product, "--format", form, "-o", tmp_path / name) == 0
+    assert r"m\udce4rz.csv" in (tmp_path / "imu.yaml").read_text("utf-8")
+    assert r"m\udce4rz.csv" in capfd.readouterr().out
+    with open_product(product) as opened:
+        assert r"f\udcfchler.csv" in opened.attrs["history"]

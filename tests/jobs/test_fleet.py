@@ -374,6 +374,18 @@ def test_files_that_are_not_read_are_named(tmp_path, capsys):
     assert "no gyro column" in notes["text"]
 
 
+def test_a_file_whose_name_is_not_utf8_does_not_stop_the_others(tmp_path):
+    write_log(tmp_path / "runs" / "log.nc", 5)
+    (tmp_path / "runs" / os.fsdecode(b"m\xe4rz.csv")).write_text("time [s],gyro_x [deg/h]\n")
+    table = write_file_table([tmp_path / "runs"], tmp_path / "files.parquet", scheduler="threads")
+    assert table.set_index(table["file"].map(lambda name: Path(name).name))["is_log"].to_dict() == {
+        "log.nc": True,
+        r"m\udce4rz.csv": False,
+    }
+    assert "rename the file" in table["note"].iloc[1]
+    assert list(run_fleet([tmp_path / "runs"], tmp_path / "fleet", **OPTIONS)["run"]) == ["runs"]
+
+
 def test_a_store_whose_files_have_other_names_is_listed_again(tmp_path, monkeypatch):
     store, table = tmp_path / "archive" / "log.zarr", tmp_path / "files.parquet"
     store.parent.mkdir()
