@@ -14,7 +14,7 @@ from pathlib import Path
 import gyrostab
 from gyrostab.errors import GyrostabError
 from gyrostab.ingest.scan_output import print_scan
-from gyrostab.jobs.run import load_log, run
+from gyrostab.jobs.run import find_job_name, load_log, read_job_name, run
 
 
 def find_logs(folder, *, pattern):
@@ -25,17 +25,13 @@ def find_logs(folder, *, pattern):
     return logs
 
 
-def is_current(target, *, sources):
-    """Whether a result exists and is newer than all of its sources."""
-    return target.exists() and all(
-        source.stat().st_mtime < target.stat().st_mtime for source in sources
-    )
-
-
 def make_log(logs, target, *, reading):
-    """Place all files on one uniform time axis, with a table of gaps."""
-    print_scan(gyrostab.scan(logs, **reading))
-    gyrostab.to_netcdf(load_log(logs, **reading), target, overwrite=True)
+    """Place all files on one uniform time axis, unless `target` is of these files and options."""
+    job = find_job_name(logs, reading=reading, windows={}, fitting=None)
+    if read_job_name(target) != job:
+        print_scan(gyrostab.scan(logs, **reading))
+        log = load_log(logs, **reading).assign_attrs(gyrostab_job=job)
+        gyrostab.to_netcdf(log, target, overwrite=True)
 
 
 def show(product):
@@ -55,8 +51,7 @@ def main(plan_file):
     results.mkdir(parents=True, exist_ok=True)
 
     logs = find_logs(folder / plan["logs"]["folder"], pattern=plan["logs"]["pattern"])
-    if not is_current(results / "log.nc", sources=[*logs, plan_file]):
-        make_log(logs, results / "log.nc", reading=plan["reading"])
+    make_log(logs, results / "log.nc", reading=plan["reading"])
     target, steps = results / "product.nc", {key: plan[key] for key in ("windows", "fitting")}
     run([results / "log.nc"], target, **steps, resume=plan["results"]["resume"], overwrite=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import runpy
 import shutil
 import subprocess
@@ -122,6 +123,21 @@ def test_second_start_keeps_complete_results(archive):
     assert done.returncode == 0, done.stderr
     assert "product.nc is complete already" in done.stderr
     assert [path.stat().st_mtime_ns for path in results] == before
+
+
+def test_the_log_is_that_of_the_files_that_are_there(tmp_path, capsys):
+    """Also where a file is added with the time of its recording, or removed."""
+    make_log = runpy.run_path(str(ROOT / "pipelines" / "archive.py"))["make_log"]
+    logs = [tmp_path / f"run_{9 - number}.csv" for number in range(len(DAYS))]
+    for number, day in enumerate(DAYS):
+        write_day(tmp_path, number, day, hours=0.5)
+        os.utime(logs[number], ns=(10**18, 10**18 + number))
+    target = tmp_path / "log.nc"
+    for files in (logs[:2], logs, logs[1:], logs[1:]):
+        make_log(files, target, reading={})
+        with gyrostab.open_log(target) as log:
+            assert sorted(log.attrs["source_files"]) == sorted(path.name for path in files)
+    assert capsys.readouterr().out.count("run_7.csv") == 2  # once for each log that was made
 
 
 def test_message_without_logs(tmp_path, monkeypatch):
