@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import threading
+import zlib
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -29,6 +31,7 @@ from gyrostab.store.private import library_lock
 _MAX_CACHED_LAYOUTS = 2**12
 #: Numbers of the filters of HDF5 that are known here.
 _DEFLATE, _SHUFFLE, _FLETCHER32, _ZSTD = 1, 2, 3, 32015
+_CHECKSUM_BYTES = 4
 
 
 class ChunkDamage(Exception):
@@ -67,13 +70,14 @@ class ChunkCache:
 
 @dataclass(frozen=True, eq=False)
 class _Hdf5Layout:
-    """Type, filters in the order of reading, and the places of the chunks.
+    """Type, filters in the order of reading, values of a chunk, and the places of the chunks.
 
     The place of a chunk is its first byte, its size, and a mask of the filters that were skipped.
     """
 
     dtype: np.dtype[Any]
     codecs: tuple[tuple[int, Any], ...]
+    size: int
     places: dict[tuple[int, ...], tuple[int, int, int]]
     damage: str
 
@@ -82,6 +86,7 @@ class _Hdf5Layout:
 class _ZarrLayout:
     dtype: np.dtype[Any]
     codecs: tuple[Any, ...]
+    size: int  # values of a chunk
     separator: str
 
 
@@ -148,9 +153,8 @@ def read_chunk(
         raise ChunkDamage(f"is damaged: {error}") from error
     if len(data) < size:
         raise ChunkDamage("is missing: the file is cut short")
-    return decode_chunk(
-        data, [codec for number, codec in layout.codecs if not mask >> number & 1], layout.dtype
-    )
+    codecs = [codec for number, codec in layout.codecs if not mask >> number & 1]
+    return decode_chunk(data, codecs, layout.dtype, layout.size)
 
 
 @lru_cache(maxsize=_MAX_CACHED_LAYOUTS)
@@ -185,13 +189,11 @@ def _read_hdf5_layout(path: Path, name: str, opened: str) -> _Hdf5Layout:
                 variable.id.chunk_iter(note)
             except Exception as error:  # h5py raises errors of many kinds on a damaged index
                 damage = f"the index of {name} cannot be read ({error})"
-    return _Hdf5Layout(dtype, codecs, places, damage)
+    return _Hdf5Layout(dtype, codecs, math.prod(lengths), places, damage)
 
 
 def find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
     """Make the codecs of the filters, in the order of reading, with their numbers."""
-    from numcodecs import Zlib, Zstd
-
     codecs: list[tuple[int, Any]] = []
     for number in reversed(range(plist.get_nfilters())):
         code, _, values, _ = plist.get_filter(number)
@@ -199,11 +201,11 @@ def find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
         if code == _SHUFFLE:
             codec = _Shuffle(values[0])
         elif code == _DEFLATE:
-            codec = Zlib(*values[:1])
+            codec = _Deflate(*values[:1])
         elif code == _FLETCHER32:
             codec = _Fletcher32()
         elif code == _ZSTD:
-            codec = Zstd(*values[:1])
+            codec = _Zstd(*values[:1])
         codecs.append((number, codec))
     return tuple(codecs)
 
@@ -218,7 +220,7 @@ class _Shuffle:
         """Bring together the bytes of each place within the numbers of an array."""
         return data.reshape(-1, 1).view(np.uint8).T.tobytes()
 
-    def decode(self, data: Any) -> Any:
+    def decode(self, data: Any, max_bytes: int) -> Any:
         """Restore the order of the bytes."""
         from numcodecs import Shuffle
 
@@ -241,7 +243,7 @@ class _Fletcher32:
 
         return np.frombuffer(Fletcher32().encode(data), np.uint8)
 
-    def decode(self, data: Any) -> NDArray[np.uint8]:
+    def decode(self, data: Any, max_bytes: int) -> NDArray[np.uint8]:
         """Verify the checksum and return the bytes before it."""
         from numcodecs import Fletcher32
 
@@ -254,20 +256,82 @@ class _Fletcher32:
 class _Blosc:
     """Blosc, which reads beyond a cut chunk, with a check of the length."""
 
-    def decode(self, data: Any) -> Any:
-        """Check the length and decompress the bytes."""
+    def decode(self, data: Any, max_bytes: int) -> Any:
+        """Check the lengths and decompress the bytes."""
         from numcodecs import blosc
 
         if is_blosc_cut(data[:16], len(data)):
             raise RuntimeError("it is cut short")
+        _check_size(int.from_bytes(data[4:8], "little"), max_bytes)
         return blosc.decompress(data)
+
+
+@dataclass(frozen=True)
+class _Deflate:
+    """The compression of zlib."""
+
+    level: int = 1
+
+    def encode(self, data: Any) -> bytes:
+        """Compress the bytes."""
+        return zlib.compress(data, self.level)
+
+    def decode(self, data: Any, max_bytes: int) -> bytes:
+        """Decompress the bytes, of which no more are made than one too many."""
+        decoder = zlib.decompressobj()
+        values = decoder.decompress(data, max_bytes + 1)
+        _check_size(len(values), max_bytes)
+        if not decoder.eof:
+            raise RuntimeError("it is cut short")
+        return values
+
+
+@dataclass(frozen=True)
+class _Zstd:
+    """Zstandard."""
+
+    level: int = 1
+
+    def encode(self, data: Any) -> Any:
+        """Compress the bytes."""
+        from numcodecs import Zstd
+
+        return Zstd(self.level).encode(data)
+
+    def decode(self, data: Any, max_bytes: int) -> Any:
+        """Check the length and decompress the bytes."""
+        from numcodecs import zstd
+
+        size = _read_zstd_size(bytes(data[:18]))
+        if size is None:
+            return zstd.decompress(data, np.empty(max_bytes, np.uint8))
+        _check_size(size, max_bytes)
+        return zstd.decompress(data)
+
+
+def _read_zstd_size(header: bytes) -> int | None:
+    """Read the size of the content from the header of a frame (RFC 8878, section 3.1.1.1).
+
+    A header without it has None; then the content must have the size of the chunk.
+    """
+    descriptor = header[4]
+    is_single_segment = descriptor >> 5 & 1
+    begin = 5 + (not is_single_segment) + (0, 1, 2, 4)[descriptor & 3]
+    length = (is_single_segment, 2, 4, 8)[descriptor >> 6]
+    size = int.from_bytes(header[begin : begin + length], "little")
+    return size + 256 * (length == 2) if length else None
+
+
+def _check_size(size: int, max_bytes: int) -> None:
+    if size > max_bytes:
+        raise RuntimeError(f"it holds more than the {max_bytes} bytes of a chunk")
 
 
 @dataclass(frozen=True)
 class _UnknownFilter:
     name: str
 
-    def decode(self, data: bytes) -> bytes:
+    def decode(self, data: bytes, max_bytes: int) -> bytes:
         raise ChunkDamage(f"cannot be read: gyrostab does not support {self.name}")
 
 
@@ -286,7 +350,8 @@ def _read_zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray
         if error.errno != errno.EIO:
             raise FormatError(f"{folder / name}: cannot be read ({error.strerror})") from error
         raise ChunkDamage(f"is damaged: {folder.name}/{name}: {error}") from error
-    return decode_chunk(data, layout.codecs, layout.dtype, name=f"{folder.name}/{name}: ")
+    where = f"{folder.name}/{name}: "
+    return decode_chunk(data, layout.codecs, layout.dtype, layout.size, name=where)
 
 
 @lru_cache(maxsize=_MAX_CACHED_LAYOUTS)
@@ -297,6 +362,7 @@ def _read_zarr_layout(folder: Path, opened: str) -> _ZarrLayout:
         return _ZarrLayout(
             np.dtype(layout["dtype"]),
             find_zarr_codecs(layout),
+            math.prod(layout["chunks"]),
             str(layout.get("dimension_separator", ".")),
         )
     except OSError as error:
@@ -311,9 +377,9 @@ def _read_zarr_layout(folder: Path, opened: str) -> _ZarrLayout:
 
 def find_zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
     """Make the codecs of a variable, in the order of reading."""
-    from numcodecs import Zlib, Zstd
-
-    known_codecs = {"blosc": _Blosc, "fletcher32": _Fletcher32, "zlib": Zlib, "zstd": Zstd}
+    known_codecs: dict[str, Any] = {
+        "blosc": _Blosc, "fletcher32": _Fletcher32, "zlib": _Deflate, "zstd": _Zstd
+    }  # fmt: skip
     described = [
         item for item in [layout["compressor"], *reversed(layout["filters"] or ())] if item
     ]
@@ -326,9 +392,11 @@ def find_zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def decode_chunk(
-    data: Any, codecs: Iterable[Any], dtype: np.dtype[Any], *, name: str = ""
+    data: Any, codecs: Sequence[Any], dtype: np.dtype[Any], size: int, *, name: str = ""
 ) -> NDArray[Any]:
-    """Decode the bytes of a chunk to numbers.
+    """Decode the bytes of a chunk to numbers, of which a whole chunk has `size`.
+
+    No codec makes more bytes than such a chunk needs, whatever the file holds.
 
     Raises
     ------
@@ -336,8 +404,9 @@ def decode_chunk(
         When decoding fails; the message begins with `name`.
     """
     try:
-        for codec in codecs:
-            data = codec.decode(data)
+        for number, codec in enumerate(codecs, 1):
+            checksums = sum(isinstance(later, _Fletcher32) for later in codecs[number:])
+            data = codec.decode(data, size * dtype.itemsize + checksums * _CHECKSUM_BYTES)
         return np.frombuffer(data, dtype)
     except ChunkDamage:
         raise

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import tracemalloc
 from pathlib import Path
 
 import numcodecs
@@ -13,6 +14,7 @@ import xarray as xr
 
 from gyrostab import make_log, open_log, read_log, scan, to_zarr
 from gyrostab.errors import FormatError
+from gyrostab.store.layout import find_zarr_codecs
 
 PICKLE = {"id": "pickle"}
 VALUES = np.arange(600.0)[None, :]
@@ -87,3 +89,42 @@ def test_a_log_that_another_program_compressed_is_read(tmp_path, codecs):
     plain.to_zarr(tmp_path / "copy.zarr", encoding={"rate": codecs}, zarr_format=2)
     with open_log(tmp_path / "copy.zarr") as log:
         np.testing.assert_array_equal(log["rate"].values, VALUES)
+
+
+@pytest.mark.parametrize(
+    "codec", [numcodecs.Zlib(9), numcodecs.Zstd(9), numcodecs.Blosc("zstd", clevel=9)]
+)
+def test_a_chunk_that_grows_beyond_its_size_takes_no_memory(tmp_path, codec):
+    path = to_zarr(make_log(VALUES, rate=10.0, unit="deg/h"), tmp_path / "log.zarr")
+    changes = {"compressor": codec.get_config(), "filters": None}
+    use_codecs(path, changes, consolidated=True)
+    n_bytes = 32 << 20
+    (path / "rate" / "0.0").write_bytes(codec.encode(np.zeros(n_bytes, np.uint8)))
+    with open_log(path) as log:
+        tracemalloc.start()
+        with pytest.warns(UserWarning, match="more than the 4800 bytes of a chunk"):
+            assert np.isnan(log["rate"].values).all()
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak < n_bytes / 4
+
+
+@pytest.mark.parametrize("count", [1, 200, 256, 257, 65_792, 2_000_000])
+def test_zstandard_content_of_every_length_is_read(count):
+    (codec,) = find_zarr_codecs({"compressor": numcodecs.Zstd(1).get_config(), "filters": None})
+    values = np.arange(count, dtype=np.uint8)
+    packed = numcodecs.Zstd(1).encode(values)
+    for data in (packed, np.frombuffer(packed, np.uint8)):
+        np.testing.assert_array_equal(np.frombuffer(codec.decode(data, count), np.uint8), values)
+    with pytest.raises(RuntimeError, match="more than the"):
+        codec.decode(packed, count - 1)
+
+
+def test_zstandard_content_without_its_length_has_that_of_the_chunk():
+    """A frame as programs write it that do not know the length when they begin."""
+    (codec,) = find_zarr_codecs({"compressor": {"id": "zstd"}, "filters": None})
+    content = bytes(range(16))
+    frame = bytes.fromhex("28b52ffd 00 58") + (1 | 16 << 3).to_bytes(3, "little") + content
+    assert bytes(codec.decode(frame, 16)) == content
+    with pytest.raises(RuntimeError):
+        codec.decode(frame, 15)

@@ -197,9 +197,9 @@ def test_what_stands_behind_a_chunk_that_is_cut_short_is_not_read():
     codecs = layout_module.find_zarr_codecs(
         {"compressor": Blosc("lz4").get_config(), "filters": None}
     )
-    assert layout_module.decode_chunk(packed, codecs, np.dtype("i8")).size == 10_000
+    assert layout_module.decode_chunk(packed, codecs, np.dtype("i8"), 10_000).size == 10_000
     with pytest.raises(layout_module.ChunkDamage, match="it is cut short"):
-        layout_module.decode_chunk(memoryview(packed)[:-1], codecs, np.dtype("i8"))
+        layout_module.decode_chunk(memoryview(packed)[:-1], codecs, np.dtype("i8"), 10_000)
 
 
 def test_a_library_that_fails_in_a_late_read_names_the_file(tmp_path, monkeypatch):
