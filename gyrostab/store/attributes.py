@@ -35,6 +35,7 @@ _TITLES = {
     "dataset": "Gyro stability data",
 }
 JSON_NAMES = "json_attributes"
+_NETCDF_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 
 # Names that UDUNITS reads as intended. An integer power may follow; UDUNITS misreads a fractional
 # one without an error, so none passes.
@@ -59,17 +60,43 @@ def encode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
         attrs[make_name_storable(str(name), attrs, kind="attribute")] = attrs.pop(name)
     coded = []
     for name, value in attrs.items():
-        if isinstance(value, np.generic):
-            attrs[name] = value = value.item()
+        attrs[name] = value = _convert_value(value)
         if isinstance(value, str):
             attrs[name] = escape_text(value)
-        if isinstance(value, bool) or not isinstance(value, str | int | float | np.ndarray):
+        if not _is_netcdf_value(value):
             # in ASCII: Octave cannot list a file with other characters in a global attribute
             attrs[name] = json.dumps(value, default=str)
             coded.append(name)
     if coded:
         attrs[JSON_NAMES] = json.dumps(coded)
     return attrs
+
+
+def _convert_value(value: Any) -> Any:
+    """Convert a value of numpy to one of Python; an array that NetCDF can hold stays.
+
+    Examples
+    --------
+    >>> _convert_value(np.datetime64("2026-05-01T00:00", "s")), _convert_value(np.eye(2, dtype=int))
+    ('2026-05-01T00:00:00', [[1, 0], [0, 1]])
+    """
+    if not isinstance(value, np.ndarray | np.generic) or _is_netcdf_value(value):
+        return value
+    if value.dtype.kind not in "mM":
+        return value.tolist()
+    return value.astype(str).tolist() if value.ndim else str(value)
+
+
+def _is_netcdf_value(value: Any) -> bool:
+    """Whether an attribute of NetCDF can be a value: text, a number, or a list of them."""
+    if isinstance(value, np.ndarray):
+        is_native = value.dtype.kind in "US" or value.dtype.str[1:] in _NETCDF_TYPES
+        return value.ndim == 1 and is_native
+    if isinstance(value, bool | np.generic):
+        return False
+    if isinstance(value, int):
+        return -(2**63) <= value < 2**64
+    return isinstance(value, str | float)
 
 
 def find_version(package: str) -> str:

@@ -91,6 +91,8 @@ def to_disk(
     ]
     variables: dict[Any, xr.Variable] = {}
     for name, variable in dataset.variables.items():
+        if variable.dtype == np.float16:  # NetCDF has no such type
+            variable = variable.astype(np.float32)
         known_attrs = {key: item for key, item in variable.attrs.items() if key not in _DECODING}
         if name in grids:
             encode = encode_all_stamps if stamps else encode_first_stamp

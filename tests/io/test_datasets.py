@@ -538,6 +538,30 @@ def test_lazy_numbers_and_arrays_in_attributes_can_be_written(tmp_path, write):
 
 
 @pytest.mark.parametrize("write", [to_netcdf, to_zarr])
+def test_values_of_numpy_in_attributes_can_be_written(tmp_path, write):
+    attributes = {
+        "installed": (np.datetime64("2026-01-01T06:00", "s"), "2026-01-01T06:00:00"),
+        "serviced": (np.array(["2026-01-01"], "M8[D]"), ["2026-01-01"]),
+        "is_used": (np.array([True, False]), [True, False]),
+        "matrix": (np.eye(2), [[1.0, 0.0], [0.0, 1.0]]),
+        "mixed": (np.array(["a", 1], dtype=object), ["a", 1]),
+        "half": (np.array([0.5], np.float16), [0.5]),
+        "long": (2**70, 2**70),
+        "unsigned": (np.uint64(2**63 + 5), 2**63 + 5),
+    }
+    log = make_log(np.arange(3.0), rate=10.0, unit="deg/h")
+    log["pressure"] = ("time", np.arange(3, dtype=np.float16), {"units": "Pa"})
+    log.attrs |= {name: value for name, (value, _) in attributes.items()}
+    log["pressure"].attrs |= {name: value for name, (value, _) in attributes.items()}
+    with open_log(write(log, tmp_path / "log")) as back:
+        for attrs in (back.attrs, back["pressure"].attrs):
+            assert {name: attrs[name] for name in attributes} == {
+                name: expected for name, (_, expected) in attributes.items()
+            }
+        np.testing.assert_array_equal(back["pressure"], [0.0, 1.0, 2.0])
+
+
+@pytest.mark.parametrize("write", [to_netcdf, to_zarr])
 def test_attributes_of_a_packed_variable_do_not_change_its_numbers(tmp_path, write):
     """As where netCDF4 has scaled the values, and its attributes are copied."""
     packing = {
