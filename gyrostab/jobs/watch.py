@@ -167,6 +167,13 @@ def watch(
                             "new one would include; move or remove that folder, or give another "
                             "name with -o"
                         )
+                    if until is None and (earlier_files := list_files(place)):
+                        count = len(earlier_files)
+                        listener.show_note(
+                            f"{place} holds the rows of an earlier live view ({count} "
+                            f"file{'s' * (count > 1)}), which are part of this one; stop, and move "
+                            "that folder, if they should not be"
+                        )
                     keeper = RowKeeper(stream or sys.stdin.buffer, rows_folder(path))
                 attrs = {_IDENTITY: json.dumps(identity)}
                 view = _View(path, options, attrs, wait, alarms, listener, until)

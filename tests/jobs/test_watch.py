@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import platform
+import shutil
 import signal
 import subprocess
 import sys
@@ -204,6 +205,11 @@ def test_standard_input_is_kept_and_continued(tmp_path):
     run(pieces, tmp_path / "kept.nc", windows=WINDOWS)
     assert_same_product(output, tmp_path / "kept.nc")
     assert first.windows[-1]["time"] < second.windows[0]["time"]
+    assert not any("earlier live view" in note for note in second.notes)
+    shutil.rmtree(output)
+    third = follow("-", output, stream=io.BytesIO(b""))
+    (note,) = [note for note in third.notes if "earlier live view (2 files)" in note]
+    assert str(rows_folder(output)) in note
     with pytest.raises(OutputError, match="rows of an earlier live view"):
         follow("-", output, stream=io.BytesIO(b""), overwrite=True)
 
