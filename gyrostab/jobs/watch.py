@@ -380,7 +380,8 @@ class _View:
         changed = [part for part, is_same in zip(units, same, strict=True) if not is_same]
         layout = {"size": units[-1].stop, "unit": units[0].stop}
         try:
-            write_windows(self.path, compute(changed), new=not exists, **layout)
+            is_continued = exists and same_record  # otherwise all units have changed
+            write_windows(self.path, compute(changed), new=not is_continued, **layout)
         except LayoutError:
             write_windows(self.path, compute(units), new=True, **layout)
         self.digests = digests

@@ -193,6 +193,20 @@ def test_a_file_that_is_cut_is_followed_on(tmp_path):
     )
 
 
+def test_a_product_of_another_record_is_replaced_as_a_whole(tmp_path):
+    """A store that is rewritten in place would have windows of both after a kill."""
+    rows, stores = make_rows(8_000), []
+    source, output = tmp_path / "log.csv", tmp_path / "live.zarr"
+    view = module._View(output, check_options(windows=WINDOWS), {}, 0.0, [], Recorder(), None)
+    for count in (5_000, 6_500, 4_000, 8_000):
+        source.write_text(HEADER + "".join(rows[:count]))
+        view.take_files(follow_module.list_files(str(source)))
+        view.update()
+        stores.append(output.stat().st_ino)
+    begun, continued, replaced, continued_again = stores
+    assert begun == continued != replaced == continued_again
+
+
 def test_standard_input_is_kept_and_continued(tmp_path):
     rows = make_rows(20_000)
     text = HEADER + "".join(rows)
