@@ -196,7 +196,10 @@ def index_files(
     """
     options = json.dumps(dict(reading), sort_keys=True, default=str)
     records: Any = [] if known is None else known.to_dict("records")
-    old_rows = {row["file"]: row for row in records}
+    old_rows = {
+        row["file"]: {key: None if value is pd.NA else value for key, value in row.items()}
+        for row in records
+    }
     rows: dict[str, dict[str, Any]] = {}
     changed: list[str] = []
     for path in [*archive.files, *archive.diagnoses]:
@@ -230,7 +233,11 @@ def index_files(
     for done, (call, described) in enumerate(run_calls(pool, calls), 1):
         rows[call[1]].update(described)
         stage("indexing", len(names), done, "files")
-    return pd.DataFrame(list(rows.values()))
+    whole_numbers = {  # also where a file has none, as a link to nothing; floats would round them
+        key: pd.array([row[key] for row in rows.values()], dtype="Int64")
+        for key in ("bytes", "changed_ns")
+    }
+    return pd.DataFrame(list(rows.values())).assign(**whole_numbers)
 
 
 def _describe_log(name: str, reading: Mapping[str, Any]) -> dict[str, Any]:

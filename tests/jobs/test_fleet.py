@@ -386,6 +386,24 @@ def test_a_file_whose_name_is_not_utf8_does_not_stop_the_others(tmp_path):
     assert list(run_fleet([tmp_path / "runs"], tmp_path / "fleet", **OPTIONS)["run"]) == ["runs"]
 
 
+def test_files_next_to_a_dead_link_are_opened_once(tmp_path, monkeypatch):
+    write_log(tmp_path / "runs" / "log.nc", 5)
+    (tmp_path / "runs" / "dead.csv").symlink_to(tmp_path / "nothing.csv")
+    opened: list[str] = []
+
+    def count(name, options):
+        opened.append(Path(name).name)
+        return scan_file(name, options)
+
+    monkeypatch.setattr("gyrostab.jobs.archive.scan_file", count)
+    table = tmp_path / "files.parquet"
+    for _ in range(3):
+        write_file_table([tmp_path / "runs"], table, scheduler="threads")
+    assert sorted(opened) == ["dead.csv", "log.nc"]
+    stored = pd.read_parquet(table).set_index("is_log")["changed_ns"]
+    assert stored[True] == (tmp_path / "runs" / "log.nc").stat().st_mtime_ns
+
+
 def test_a_store_whose_files_have_other_names_is_listed_again(tmp_path, monkeypatch):
     store, table = tmp_path / "archive" / "log.zarr", tmp_path / "files.parquet"
     store.parent.mkdir()
