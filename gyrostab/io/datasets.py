@@ -254,7 +254,7 @@ def begin_zarr(dataset: xr.Dataset, path: Path, encoding: dict[Any, dict[str, An
     """Write variables in memory to a new Zarr store, without consolidated metadata."""
     dataset.to_zarr(
         path,
-        mode="w",
+        mode="w-",  # "w" would make the folder anew, with other permissions
         zarr_format=2,
         consolidated=False,
         encoding=encoding,

@@ -9,6 +9,7 @@ import os
 import re
 import secrets
 import shutil
+import stat
 import time
 import warnings
 from collections.abc import Iterable, Iterator
@@ -190,13 +191,19 @@ def _make_folder(folder: Path) -> list[Path]:
 
 @contextlib.contextmanager
 def _temporary_output(target: Path, temporary: Path, *, make_folder: bool) -> Iterator[Path]:
-    """Make a hidden file or folder, and remove it if the block fails; explain write errors."""
+    """Make a hidden file or folder, and remove it if the block fails; explain write errors.
+
+    It has the permissions of an existing target, and can be written.
+    """
     complete = False
     try:
         if make_folder:
             temporary.mkdir()
         else:
             os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        with contextlib.suppress(OSError):  # without an output to be replaced
+            mode = stat.S_IMODE(target.stat().st_mode)
+            temporary.chmod(mode | (0o700 if make_folder else 0o600))
         yield temporary
         complete = True
     except (OSError, RuntimeError) as error:

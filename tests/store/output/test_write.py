@@ -131,3 +131,25 @@ def test_output_has_the_usual_permissions(tmp_path):
     finally:
         os.umask(umask)
     assert path.stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o660])
+def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path, mode):
+    path = to_netcdf(synthetic.surface(windows=3), tmp_path / "out.nc")
+    path.chmod(mode)
+    to_netcdf(synthetic.surface(windows=4), path, overwrite=True)
+    assert path.stat().st_mode & 0o777 == mode
+
+
+def test_a_store_that_is_replaced_keeps_its_permissions(tmp_path):
+    path = to_zarr(synthetic.surface(windows=3), tmp_path / "out.zarr")
+    path.chmod(0o700)
+    to_zarr(synthetic.surface(windows=4), path, overwrite=True)
+    assert path.stat().st_mode & 0o777 == 0o700
+
+
+def test_a_file_is_private_while_it_is_written(tmp_path):
+    (tmp_path / "out.txt").write_text("old")
+    (tmp_path / "out.txt").chmod(0o400)
+    with new_output(tmp_path / "out.txt", overwrite=True) as temporary:
+        assert temporary.stat().st_mode & 0o777 == 0o600  # it can be written
