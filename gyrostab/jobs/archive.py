@@ -315,9 +315,12 @@ def find_runs(
 
 
 def _name_groups(groups: Mapping[Path, list[Path]], base: Path, per: str) -> dict[str, list[Path]]:
-    """Name runs by their place below `base`; no run is inside another one."""
+    """Name runs by their place below `base`; no run is inside another one.
+
+    Names differ by more than case, which file systems of Windows and macOS do not distinguish.
+    """
     bare = {path: path.with_name(path.name.split(".")[0] or path.name) for path in groups}
-    is_shared = len(set(bare.values())) < len(bare)
+    is_shared = len({str(path).casefold() for path in bare.values()}) < len(bare)
     names: dict[Path, str] = {}
     for path in groups:
         shown = bare[path] if per == "file" and not is_shared else path
@@ -333,13 +336,14 @@ def _name_groups(groups: Mapping[Path, list[Path]], base: Path, per: str) -> dic
         for name in names.values()
         for depth in range(1, name.count("/") + 1)
     }
-    used_names, named = {*above, *RESERVED_NAMES}, {}
-    for path, name in sorted(names.items(), key=lambda item: item[1] in used_names):
-        if name in used_names:  # a folder around other runs
+    folders = {name.casefold() for name in (*above, *RESERVED_NAMES)}
+    used_names, named = set(folders), {}
+    for path, name in sorted(names.items(), key=lambda item: item[1].casefold() in folders):
+        if name.casefold() in folders:  # around other runs
             name = f"{name}/files"
-        while name in used_names:
+        while name.casefold() in used_names:
             name += "_"
-        used_names.add(name)
+        used_names.add(name.casefold())
         named[name] = groups[path]
     return named
 

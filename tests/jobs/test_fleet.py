@@ -133,6 +133,23 @@ def test_every_run_has_a_name_also_where_a_folder_is_called_files(tmp_path):
     }  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("names", "per", "expected"),
+    [
+        (["x/log.csv", "x/LOG.txt"], "file", {"x/log.csv", "x/LOG.txt"}),
+        (["run/1.nc", "RUN/2.nc"], "folder", {"run", "RUN_"}),
+        (["Index.HTML/1.nc", "r/2.nc"], "folder", {"Index.HTML/files", "r"}),
+    ],
+)
+def test_names_of_runs_differ_by_more_than_case(tmp_path, names, per, expected):
+    files = [tmp_path / name for name in names]
+    table = pd.DataFrame({"file": map(str, files), "bytes": 0, "is_log": True, "note": ""})
+    runs = find_runs(Archive(tmp_path, files, []), table, per=per)
+    found = {item.name for item in runs}
+    assert len({name.casefold() for name in found}) == len(files)
+    assert found == expected
+
+
 def test_an_archive_of_ten_thousand_files_is_listed_in_linear_time(tmp_path):
     names = [f"r{number // 100}/{number}.nc" for number in range(2000)]
     for name in names:
