@@ -42,8 +42,12 @@ WEIGHTS = {code: weight for rows in TABLES.values() for code, _, _, weight in ro
 #: Unit -> unit in the JSON of ISCWSA; g-dependent terms are per g, the acceleration in the weights.
 _JSON_UNITS = {"deg/h": "deg/hr", "deg/sqrt(h)": "deg/sqr(hr)", "deg/h/g": "deg/hr"}
 _WITSML_UNITS = {"deg/h": "dega/h", "deg/sqrt(h)": "dega/sqrt(h)", "deg/h/g": "dega/h/gn"}
-_WITSML_CHANNEL_UNITS = {"g": "gn", "degree_Celsius": "degC"}  # that WITSML spells otherwise
-_MAX_TEXT = 2000  # characters of a description in WITSML
+#: Unit of a channel -> its name in the list of units of Energistics.
+_WITSML_CHANNEL_UNITS = {
+    "g": "gn", "degree_Celsius": "degC", "K hour-1": "degC/h", "degree s-1": "dega/s", "V": "V",
+    "W": "W", "Pa": "Pa", "uT": "uT", "1": "Euc",
+}  # fmt: skip
+_MAX_TEXT, _MAX_TITLE = 2000, 64  # characters of a description and of a title in WITSML
 _NO_HASH = 32 * "0"
 
 
@@ -248,9 +252,11 @@ def _make_witsml(
     _add_element(root, "MisalignmentMode", "3")
     constraints = _add_element(root, "OperatingConstraints")
     for channel, (low, high, unit) in model.validity.items():
+        if unit not in _WITSML_CHANNEL_UNITS:  # the description has all channels
+            continue
         _add_element(constraints, "CustomRange", {
             "EndInclusive": "true", "StartInclusive": "true", "Start": low, "End": high,
-            "Title": channel, "Uom": _WITSML_CHANNEL_UNITS.get(unit, unit),
+            "Title": channel[:_MAX_TITLE], "Uom": _WITSML_CHANNEL_UNITS[unit],
         })  # fmt: skip
     _add_element(root, "Authorization", {
         "ApprovalAuthority": "none: to be confirmed by a survey engineer",

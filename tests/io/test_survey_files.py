@@ -197,6 +197,27 @@ class TestWitsml:
         assert float(ranges["temperature"].find(f"{WITSML}End").text) == 85.0
         assert ranges["temperature"].find(f"{WITSML}Uom").text == "degC"
 
+    def test_units_of_conditions_are_those_of_energistics(self, tmp_path):
+        product = make_product("xy")
+        units = {
+            "rotation_rate": ("degree s-1", "dega/s"),
+            "temperature_rate": ("K hour-1", "degC/h"),
+            "vibration": ("g", "gn"),
+            "x" * 70: ("V", "V"),
+            "flow": ("L/min of mud", None),
+        }
+        for name, (unit, _) in units.items():
+            product[name] = ("time", np.arange(float(product.sizes["time"])), {"units": unit})
+        to_iscwsa(product, tmp_path / "tool.xml")
+        root = ET.parse(tmp_path / "tool.xml").getroot()
+        found = {
+            element.find(f"{WITSML}Title").text: element.find(f"{WITSML}Uom").text
+            for element in root.iter(f"{WITSML}CustomRange")
+        }
+        del found["temperature"]
+        assert found == {name[:64]: unit for name, (_, unit) in units.items() if unit}
+        assert "flow 0 to 5 L/min of mud" in root.find(f"{WITSML}Application").text
+
     @pytest.mark.full
     @pytest.mark.parametrize("speed", [None, 0.5])
     def test_standard_binding_reads_and_writes_the_same_elements(self, tmp_path, speed):
