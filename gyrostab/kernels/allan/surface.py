@@ -121,13 +121,18 @@ class _Work(NamedTuple):
 
 
 def _line_removed(work: _Work) -> Floats:
-    """Angle less the line through its first and last present points, zero where it is missing."""
-    first, last = work.starts[0], work.stops[-1] - 1
+    """Angle less a line through its beginning and its end, zero where it is missing.
+
+    Medians of some present points, because a damaged one would cost all others their digits.
+    """
     values = np.asarray(work.x, dtype=np.float64)
-    line = values[first] + (values[last] - values[first]) / max(last - first, 1) * (
-        np.arange(values.size) - first
+    present = np.isfinite(values)
+    places = np.flatnonzero(present)
+    (first, low), (last, high) = (
+        (np.median(ends), np.median(values[ends])) for ends in (places[:9], places[-9:])
     )
-    return np.where(np.isfinite(values), values - line, 0.0)
+    line = low + (high - low) / max(last - first, 1.0) * (np.arange(values.size) - first)
+    return np.where(present, values - line, 0.0)
 
 
 def _strict_sums(work: _Work, gaps: bool) -> tuple[Floats, Floats]:

@@ -88,6 +88,19 @@ class TestKernels:
             for fresh, used in zip([*cells, lines], [*used_cells, used_lines], strict=True):
                 np.testing.assert_array_equal(fresh, used)
 
+    @pytest.mark.parametrize("angle", [False, True])
+    @pytest.mark.parametrize("place", [0, 999])
+    def test_damaged_sample_changes_only_its_windows(self, place, angle):
+        x = 10.0 + np.random.default_rng(5).standard_normal(1000)
+        x = np.cumsum(x) if angle else x
+        damaged = x.copy()
+        damaged[place] = 1e17
+        unit = Unit(100, 100, np.arange(1, 20), angle, 0.01, 0.3, 0.1)
+        (cells, lines), (got_cells, got_lines) = (surface_unit(y, unit) for y in (x, damaged))
+        others = slice(0, 8) if place else slice(1, 9)
+        np.testing.assert_allclose(got_lines[:3, others], lines[:3, others], rtol=1e-9)
+        np.testing.assert_allclose(got_cells.avar[others], cells.avar[others], rtol=1e-9)
+
     def test_blocks_use_the_plain_loop_where_the_vectors_cannot_be_imported(self):
         code = (
             "import sys\n"
