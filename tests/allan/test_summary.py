@@ -95,6 +95,16 @@ def test_single_outliers_are_counted_and_noisy_spans_are_not():
     assert count_outliers(values, starts, 10_000).tolist() == [2, 0, 2, 0]
 
 
+@pytest.mark.parametrize("place", [0, 19_999, 7_999, 8_001])
+def test_outliers_at_an_end_and_next_to_a_lost_sample_are_counted(place):
+    values = np.random.default_rng(6).standard_normal(20_000)
+    values[8_000] = np.nan
+    angles = np.cumsum(100.0 + np.nan_to_num(values)) + 0.0 * values
+    assert count_outliers(angles, np.array([0]), 20_000).tolist() == [0]
+    values[place] += 40.0
+    assert count_outliers(values, np.array([0]), 20_000).tolist() == [1]
+
+
 def test_slope_and_step_are_not_outliers():
     values = np.random.default_rng(5).standard_normal(20_000) + 100.0 * np.arange(20_000)
     values[10_000:] += 1e4

@@ -6,6 +6,10 @@ again over the samples around it, so that temporarily higher noise is not counte
 both differences reach 8 standard deviations with a probability of about exp(-8**2 * 2 / 3), which
 is 3e-19: never in a record.
 
+Where one neighbour is missing, or the record begins or ends, the two samples on the other side are
+used. In white noise their differences have the same distribution. Cumulative angles rise
+steadily, so the sample must also be 8 standard deviations from the line through these two.
+
 If samples are lost independently of the noise, those next to gaps scatter like the others, and the
 ratio is 1. If samples are lost while the noise is high, the samples that are left next to the gaps
 are noisier, and the window underestimates the noise of the record.
@@ -19,7 +23,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gyrostab.kernels.compiled import KERNEL
+from gyrostab.kernels.compiled import INNER, KERNEL
 
 LIMIT_SIGMA = 8.0
 #: Samples of a segment, and second differences spread over it whose median gives its noise to 10 %,
@@ -58,30 +62,56 @@ def _measure_noise(x: NDArray[Any], places: NDArray[np.int64]) -> NDArray[np.flo
     return np.where(count > 0, _TO_DIFFERENCE * median, 0.0)
 
 
+@njit(**INNER)
+def _measure_deviation(x, i):  # type: ignore[no-untyped-def]
+    """Find how far sample i is above or below its neighbours; not above zero if it is between."""
+    before, after = i > 0 and np.isfinite(x[i - 1]), i + 1 < x.size and np.isfinite(x[i + 1])
+    side = 1 if after else -1
+    other = i - 1 if before and after else i + 2 * side
+    if not (before or after) or other < 0 or other >= x.size:
+        return np.nan
+    sample, neighbour, second = np.float64(x[i]), np.float64(x[i + side]), np.float64(x[other])
+    low, high = min(sample - neighbour, sample - second), max(sample - neighbour, sample - second)
+    if not (before and after):
+        line = (sample - 2.0 * neighbour + second) / np.sqrt(3.0)
+        low, high = min(low, line), max(high, line)
+    return max(low, -high) if np.isfinite(sample + second) else np.nan
+
+
+@njit(**INNER)
+def _note_candidate(x, i, limit, places, deviations, count):  # type: ignore[no-untyped-def]
+    """Write sample i to the lists if it deviates by more than `limit`; returns how many do."""
+    deviation = _measure_deviation(x, i)
+    if not deviation > limit:
+        return count
+    if count < places.size:
+        places[count], deviations[count] = i, deviation
+    return count + 1
+
+
 @njit(**KERNEL)
-def _find_candidates(x, limits, places):  # type: ignore[no-untyped-def]
-    """Write the samples beyond both neighbours to `places`; returns how many there are."""
-    count = np.int64(0)
+def _find_candidates(x, limits, places, deviations):  # type: ignore[no-untyped-def]
+    """List the samples beyond the limit of their segment; returns how many there are."""
+    count = _note_candidate(x, np.int64(0), limits[0], places, deviations, np.int64(0))
     for segment in range(limits.size):
         begin, limit = np.int64(1 + segment * _SEGMENT_SAMPLES), limits[segment]
         end = min(begin + _SEGMENT_SAMPLES, x.size - 1)
         # A loop over slices that only counts, because it vectorises.
-        hits = 0
+        hits = whole = 0
         first, middle, last = x[begin - 1 : end - 1], x[begin:end], x[begin + 1 : end + 1]
         for i in range(middle.size):
             rise = np.float64(middle[i]) - np.float64(first[i])
             fall = np.float64(middle[i]) - np.float64(last[i])
             hits += 1 if (rise * fall > 0.0) & (min(abs(rise), abs(fall)) > limit) else 0
-        if hits == 0 or limit == 0.0:
+            whole += 1 if np.isfinite(rise + fall) else 0
+        if hits == 0 and whole == middle.size:
             continue
         for i in range(middle.size):
             rise = np.float64(middle[i]) - np.float64(first[i])
             fall = np.float64(middle[i]) - np.float64(last[i])
-            if (rise > limit and fall > limit) or (rise < -limit and fall < -limit):
-                if count < places.size:
-                    places[count] = begin + i
-                count += 1
-    return count
+            if not (abs(rise) <= limit or abs(fall) <= limit):  # also where one is missing
+                count = _note_candidate(x, begin + i, limit, places, deviations, count)
+    return _note_candidate(x, np.int64(x.size - 1), limits[-1], places, deviations, count)
 
 
 def _find_outliers(x: NDArray[Any]) -> NDArray[np.int64]:
@@ -90,25 +120,24 @@ def _find_outliers(x: NDArray[Any]) -> NDArray[np.int64]:
     lengths = np.minimum(begins + _SEGMENT_SAMPLES, x.size - 1) - begins
     if x.size < 3:
         return np.empty(0, np.int64)
-    apart = np.maximum(1, lengths // _MEDIAN_OF)[:, None]
-    steps = apart * np.arange(2 * _MEDIAN_OF)
+    apart = np.maximum(1, lengths // _MEDIAN_OF)
+    steps = apart[:, None] * np.arange((lengths // apart).max() + 1)
     noise = _measure_noise(x, np.where(steps < lengths[:, None], begins[:, None] + steps, -1))
-    places = np.empty(1024, np.int64)
-    count = _find_candidates(x, LIMIT_SIGMA * noise, places)
+    limits = np.where(noise > 0.0, LIMIT_SIGMA * noise, np.inf)
+    places, deviations = np.empty(1024, np.int64), np.empty(1024)
+    count = _find_candidates(x, limits, places, deviations)
     if count > places.size:
-        places = np.empty(count, np.int64)
-        _find_candidates(x, LIMIT_SIGMA * noise, places)
+        places, deviations = np.empty(count, np.int64), np.empty(count)
+        _find_candidates(x, limits, places, deviations)
     around = np.arange(2, _AROUND_SAMPLES + 2)
     outliers = []
     for chunk in range(0, count, 4096):
-        place = places[chunk : min(chunk + 4096, count)]
+        part = slice(chunk, min(chunk + 4096, count))
         level = np.maximum(
-            _measure_noise(x, place[:, None] - around[:-1]),
-            _measure_noise(x, place[:, None] + around),
+            _measure_noise(x, places[part, None] - around[:-1]),
+            _measure_noise(x, places[part, None] + around),
         )
-        before, sample, after = (x[place + shift].astype(np.float64) for shift in (-1, 0, 1))
-        nearest = np.minimum(np.abs(sample - before), np.abs(sample - after))
-        outliers.append(place[nearest > LIMIT_SIGMA * level])
+        outliers.append(places[part][deviations[part] > LIMIT_SIGMA * level])
     return np.concatenate([np.empty(0, np.int64), *outliers])
 
 

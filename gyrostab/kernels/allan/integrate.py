@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -13,52 +14,21 @@ from gyrostab.kernels.compiled import INNER, KERNEL
 
 #: Samples that are integrated and measured while they are in the cache.
 TILE = 4096
-# Samples that are seen together to be all present or all missing.
-_STRIP = 64
 # Largest angle, relative to the median change between samples, for which one double suffices: cells
 # are then wrong by 2e-11 at most, and a bias that drifts by ten times the noise within a unit of
 # work does not need two doubles.
 _PLAIN = 1e7
 
 
-@njit(**INNER)
-def _find_runs(x, starts, stops):  # type: ignore[no-untyped-def]
-    """Count the runs of finite samples, and write as many as fit to `starts` and `stops`."""
-    run = 0
-    inside = False
-    for a in range(0, x.size, _STRIP):
-        b = min(a + _STRIP, x.size)
-        finite = 0
-        for i in range(np.uint64(a), np.uint64(b)):
-            finite += np.isfinite(x[i])
-        if finite == (b - a if inside else 0):
-            continue
-        for i in range(a, b):
-            if np.isfinite(x[i]) == inside:
-                continue
-            if run < starts.size:
-                if inside:
-                    stops[run] = i
-                else:
-                    starts[run] = i
-            run += inside
-            inside = not inside
-    if inside:
-        if run < starts.size:
-            stops[run] = x.size
-        run += 1
-    return run
-
-
-@njit(**KERNEL)
-def present_runs(x):  # type: ignore[no-untyped-def]
-    """Find first and one-past-last index of every run of finite samples, as two int64 arrays."""
-    runs = np.empty((2, x.size // 256 + 16), np.int64)
-    count = _find_runs(x, runs[0], runs[1])
-    if count > runs.shape[1]:
-        runs = np.empty((2, count), np.int64)
-        _find_runs(x, runs[0], runs[1])
-    return runs[0, :count], runs[1, :count]
+def present_runs(x: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Find first and one-past-last index of every run of finite samples."""
+    present = np.isfinite(x)
+    edges = np.flatnonzero(present[1:] != present[:-1]) + 1
+    if present[0]:
+        edges = np.append(0, edges)
+    if present[-1]:
+        edges = np.append(edges, x.size)
+    return edges[::2].copy(), edges[1::2].copy()
 
 
 @njit(**INNER)
