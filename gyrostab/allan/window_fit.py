@@ -148,11 +148,12 @@ def fit_block(
         limit[fails] = _limit_of_curve(
             [cell[fails] for cell in flat], square[fails], dof[fails], tables
         )
-        upper = np.where(visible & ~(observed & observed_only), np.sqrt(limit), np.nan)
+        has_limit = visible & np.isfinite(limit) & ~(observed & observed_only)
+        upper = np.where(has_limit, np.sqrt(limit), np.nan)
     reported = observed if observed_only else visible
     stderr = np.where(reported, stderr, np.nan)
     value = np.where(reported, value, np.nan)
-    observable = np.where(observed, 2.0, np.where(visible & np.isfinite(upper), 1.0, 0.0))
+    observable = np.where(observed, 2.0, np.where(np.isfinite(upper), 1.0, 0.0))
     return np.concatenate([value, stderr, upper, observable, misfit, dof], axis=1)
 
 

@@ -822,3 +822,18 @@ def test_strong_ramp_fits_in_windows_with_gaps(block):
     # as a version wrote it that took the response of a ramp as 1
     old = surface.drop_vars("ramp_response")
     xr.testing.assert_equal(fit_noise(old), fit_noise(bare).drop_vars("ramp_response"))
+
+
+def test_window_of_no_noise_term_has_no_infinite_limit():
+    """Without a noise term that fits, no cell has degrees of freedom, and none bounds a ramp."""
+    rng = np.random.default_rng(33)
+    x = 10.0 + rng.normal(size=300)
+    rng.integers(0, 200)
+    x[rng.random(300) < 0.3] = np.nan
+    x[16:115] = 0.0
+    log = make_log(x, rate=100.0, unit="deg/h")
+    surface = davar(log, window="3s", step="3s", taus="octave", variance="modified")
+    product = fit_noise(surface, tau_min=0.01)
+    assert np.isfinite(product.avar).any()
+    assert np.isnan(product.R_upper)
+    assert product.observable.values.ravel().tolist() == [1, 0, 0, 0, 0]
