@@ -53,10 +53,7 @@ def start_compilation(module: str, kernel: Any) -> None:
 
 def await_compilation() -> None:
     """Wait for the process that `start_compilation` started, and notify listeners of `WAITING`."""
-    while _running:
-        process = _running[0]
+    for process in _running:  # several threads may wait for the same process
         if process.poll() is None:
             with event.trigger_event(WAITING):
                 process.wait()
-        if process in _running:  # another thread may have waited too
-            _running.remove(process)

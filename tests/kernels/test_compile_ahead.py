@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 from numba.core import event
 
+from gyrostab.kernels import compile_ahead
 from gyrostab.kernels.compile_ahead import WAITING, await_compilation, start_compilation
 from gyrostab.progress import show_progress
 
@@ -77,3 +78,21 @@ def test_a_process_that_fails_is_ignored(module: Path, tmp_path: Path) -> None:
     start_compilation("no_such_module", kernel_with_cache(tmp_path))
     await_compilation()
     assert not module.exists()
+
+
+def test_several_threads_wait_for_the_same_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another thread ends its wait between two steps of this one."""
+
+    class Interrupted(list):
+        searches = 0
+
+        def __contains__(self, process: object) -> bool:
+            is_in = super().__contains__(process)
+            self.searches += 1
+            if self.searches == 1:
+                await_compilation()
+            return is_in
+
+    ended = SimpleNamespace(poll=lambda: 0)
+    monkeypatch.setattr(compile_ahead, "_running", Interrupted([ended]))
+    await_compilation()
