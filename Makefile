@@ -19,7 +19,12 @@ PYTEST := -m pytest -n auto --dist loadfile --no-loadscope-reorder
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*## /\t/' | expand -t 18
 
-$(VENV)/.installed: pyproject.toml
+# numba does not notice that a function has changed which others inline: after a pull, compile all anew.
+$(VENV)/.kernels: $(shell find gyrostab/kernels -name '*.py')
+	find gyrostab -name '*.nb[ic]' -delete
+	mkdir -p $(VENV) && touch $@
+
+$(VENV)/.installed: pyproject.toml | $(VENV)/.kernels
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -e .
 	touch $@
@@ -47,7 +52,7 @@ test-install: $(VENV)/.installed-test  ## the README in a fresh checkout, and th
 test-full: $(VENV)/.installed-test  ## all tests: also whole diagnoses and calibrations, and more random examples
 	$(BIN)/python $(PYTEST) -m "" --hypothesis-profile full
 
-$(VENV)-minimum/.installed: pyproject.toml tests/support/minimum_versions.py
+$(VENV)-minimum/.installed: pyproject.toml tests/support/minimum_versions.py | $(VENV)/.kernels
 	test -x $(VENV)-minimum/bin/python || $(PYTHON) -m venv $(VENV)-minimum
 	$(PYTHON) -m tests.support.minimum_versions > $(VENV)-minimum/constraints.txt
 	$(VENV)-minimum/bin/pip install --quiet --disable-pip-version-check --prefer-binary -c $(VENV)-minimum/constraints.txt -e ".[test]"
