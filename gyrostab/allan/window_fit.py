@@ -19,6 +19,7 @@ from gyrostab.kernels.fit.freedoms import combine_diagonal
 from gyrostab.kernels.fit.least_squares import fit_windows
 from gyrostab.kernels.fit.limits import cell_limits, estimate_bounds
 from gyrostab.kernels.fit.mixture import Curves
+from gyrostab.kernels.fit.submodels import make_submodels
 from gyrostab.kernels.fit.trend import TrendTables, detrend_tables
 from gyrostab.noise import NORMAL_95, TERMS, sample_squares
 from gyrostab.units import HOUR
@@ -177,7 +178,9 @@ def run_kernel(
     noise = allowed if allowed & 15 else allowed | 1 << TERMS.index("N")  # for a ramp alone
     await_compilation()
     shared = (tables.columns, tables.to_samples, pairs, ramps, tables.diagonal, tables.weight)
-    result, misfit, dof = fit_windows(Curves(*flat), trends, *shared, noise, NORMAL_95)
+    result, misfit, dof = fit_windows(
+        Curves(*flat), trends, *shared, noise, NORMAL_95, make_submodels()
+    )
     result[..., [not allowed >> a & 1 for a in range(len(TERMS))]] = np.nan
     return result, misfit, dof
 

@@ -26,6 +26,7 @@ import hashlib
 import numpy as np
 from gyrostab.kernels.fit.least_squares import fit_windows
 from gyrostab.kernels.fit.mixture import Curves
+from gyrostab.kernels.fit.submodels import make_submodels
 
 n, windows, rng = 24, 60, np.random.default_rng(1)
 tau = np.geomspace(1.0, 1e3, n)
@@ -38,7 +39,7 @@ avar = rng.gamma(8.0, truth / 8.0, (windows, n))
 trend, diagonal = np.zeros((windows, 6)), np.full((n, 14), 0.05)
 found = fit_windows(
     Curves(avar, whole, whole, whole, whole), trend, columns, np.ones(5), pairs, ramps, diagonal,
-    np.full(n, 20.0), 31, 1.96,
+    np.full(n, 20.0), 31, 1.96, make_submodels(),
 )
 assert np.isfinite(found[0]).any()
 print(hashlib.sha256(b"".join(part.tobytes() for part in found)).hexdigest())

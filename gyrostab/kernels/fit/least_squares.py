@@ -38,7 +38,6 @@ from gyrostab.kernels.fit.mixture import (
     root_squares,
     root_units,
 )
-from gyrostab.kernels.fit.submodels import make_submodels
 
 #: Sizes as numpy integers: numba compiles `eights` again for each literal.
 _ONE, _STOCHASTIC, _TERMS, _MATRIX, _SCRATCH = (np.int64(size) for size in (1, 4, 5, 25, 75))
@@ -317,7 +316,7 @@ def _take_window(place, fit, cells, products, submodels, start):  # type: ignore
 
 @njit(**KERNEL)
 def fit_windows(  # type: ignore[no-untyped-def]
-    curves, trend, columns, to_samples, pairs, ramps, diagonal, weight, allowed, low_sigma
+    curves, trend, columns, to_samples, pairs, ramps, diagonal, weight, allowed, low_sigma, room
 ):
     """Fit every window.
 
@@ -343,6 +342,8 @@ def fit_windows(  # type: ignore[no-untyped-def]
         Bit set of the terms to fit.
     low_sigma : float
         Standard errors from an estimate to the lower end of its interval.
+    room : Submodels
+        Result of `make_submodels`, overwritten.
 
     Returns
     -------
@@ -363,8 +364,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
     cells, fit, units = _make_cells(size), _make_fit(), eights(5 * size)
     augmented, products = eights(size * (size + WIDTH)), eights(10 * PRODUCTS)
     chi2, valid, squares = eights(_ONE), np.empty(PLACES, np.int64), np.empty(5)
-    submodels, start = make_submodels(), np.empty(4)
-    stochastic = allowed & 15
+    start, stochastic = np.empty(4), allowed & 15
     for first in range(0, n_windows, PLACES):
         _observe_eight(first, curves, columns, to_samples, cells, trend, valid)
         describe_gaps(columns, to_samples, diagonal, cells)
@@ -382,10 +382,8 @@ def fit_windows(  # type: ignore[no-untyped-def]
             for a in range(4):
                 misfit[w, 1] -= 1.0 if fit.terms[a, place] > 0.5 else 0.0
             misfit[w, 1] = max(misfit[w, 1], 0.0)  # also with more terms than cells
-            _take_window(place, fit, cells, products, submodels, start)
-            average_submodels(
-                allowed, start, cells.trend[4, place], low_sigma, submodels, result[w]
-            )
+            _take_window(place, fit, cells, products, room, start)
+            average_submodels(allowed, start, cells.trend[4, place], low_sigma, room, result[w])
             for a in range(5):
                 squares[a] = result[w, 0, a] if result[w, 0, a] > 0.0 else 0.0
             degrees_of_freedom(squares, curves, w, columns, to_samples, diagonal, dof[w])

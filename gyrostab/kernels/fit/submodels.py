@@ -9,11 +9,10 @@ negative. `gyrostab.kernels.fit.averages` averages the sets.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections import namedtuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from gyrostab.kernels.compiled import INNER
 from gyrostab.kernels.fit.mixture import PRODUCTS
@@ -24,61 +23,41 @@ SETS = 16
 _PASSES = 3
 
 
-class Submodels(NamedTuple):
-    """The reduced window, in units in which M has a unit diagonal, and scratch."""
+#: Arrays of `Submodels`.
+_SHAPES: dict[str, int | tuple[int, ...]] = {
+    "data": 4,
+    "normal": (4, 4),
+    "products": (PRODUCTS, 10),
+    "scale": 4,
+    "trend": 5,
+    "covariance": 10,
+    "whitener": (4, 4),
+    "design": (4, 5),
+    "inner": (4, 4),
+    # Estimates, what negative ones cost, their weights on the data, log-likelihood of each set,
+    # also -inf unless all its estimates are positive, mean and variance of the trend's variance;
+    # weights of the sets in a mean and a law of scatter.
+    "estimates": (SETS, 4),
+    "penalties": (SETS, 4),
+    "rows": (SETS, 4, 4),
+    "likelihood": SETS,
+    "feasible": SETS,
+    "slope": (SETS, 2),
+    "weights": (SETS, 2),
+    "squares": 5,
+    # Product of the covariance with a row on the data, and covariance of a term with the others.
+    "image": 4,
+    "shared": 4,
+    # Quadratic form that turns a covariance of the data into a variance of a term.
+    "form": 10,
+}
+#: The reduced window, in units in which M has a unit diagonal, and scratch.
+Submodels = namedtuple("Submodels", _SHAPES)  # type: ignore[misc]
 
-    data: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    products: NDArray[np.float64]
-    scale: NDArray[np.float64]
-    trend: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    whitener: NDArray[np.float64]
-    design: NDArray[np.float64]
-    inner: NDArray[np.float64]
-    #: Estimates, what negative ones cost, their weights on the data, log-likelihood of each set,
-    #: also -inf unless all its estimates are positive, mean and variance of the trend's variance;
-    #: weights of the sets in a mean and a law of scatter.
-    estimates: NDArray[np.float64]
-    penalties: NDArray[np.float64]
-    rows: NDArray[np.float64]
-    likelihood: NDArray[np.float64]
-    feasible: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    squares: NDArray[np.float64]
-    #: Product of the covariance with a row on the data, and covariance of a term with the others.
-    image: NDArray[np.float64]
-    shared: NDArray[np.float64]
-    #: Quadratic form that turns a covariance of the data into a variance of a term.
-    form: NDArray[np.float64]
 
-
-@njit(**INNER)
-def make_submodels():  # type: ignore[no-untyped-def]
+def make_submodels() -> Submodels:
     """Make the arrays of `Submodels`."""
-    return Submodels(
-        np.zeros(4),
-        np.zeros((4, 4)),
-        np.zeros((PRODUCTS, 10)),
-        np.zeros(4),
-        np.zeros(5),
-        np.zeros(10),
-        np.zeros((4, 4)),
-        np.zeros((4, 5)),
-        np.zeros((4, 4)),
-        np.zeros((SETS, 4)),
-        np.zeros((SETS, 4)),
-        np.zeros((SETS, 4, 4)),
-        np.zeros(SETS),
-        np.zeros(SETS),
-        np.zeros((SETS, 2)),
-        np.zeros((SETS, 2)),
-        np.zeros(5),
-        np.zeros(4),
-        np.zeros(4),
-        np.zeros(10),
-    )
+    return Submodels(*map(np.zeros, _SHAPES.values()))
 
 
 @njit(**INNER)

@@ -15,6 +15,7 @@ from gyrostab.kernels.fit.covariance import product_tables
 from gyrostab.kernels.fit.freedoms import combine_diagonal
 from gyrostab.kernels.fit.least_squares import fit_windows
 from gyrostab.kernels.fit.mixture import Curves
+from gyrostab.kernels.fit.submodels import make_submodels
 from gyrostab.noise import avar_columns, sample_squares
 
 FIT = """
@@ -24,8 +25,9 @@ import numpy as np
 from gyrostab.kernels.fit import lanes
 from gyrostab.kernels.fit.least_squares import fit_windows
 from gyrostab.kernels.fit.mixture import Curves
+from gyrostab.kernels.fit.submodels import make_submodels
 given = [np.load(sys.argv[1])[f"arr_{i}"] for i in range(12)]
-found = fit_windows(Curves(*given[:5]), *given[5:], 31, 1.96)
+found = fit_windows(Curves(*given[:5]), *given[5:], 31, 1.96, make_submodels())
 np.savez(sys.argv[2], *found, places=lanes.PLACES)
 """
 
@@ -55,7 +57,8 @@ def test_plain_numba_gives_the_fit_of_the_vectors(tmp_path):
     )
     plain = np.load(tmp_path / "found.npz")
     assert (lanes.PLACES, int(plain["places"])) == (8, 1)
-    for number, expected in enumerate(fit_windows(Curves(*given[:5]), *given[5:], 31, 1.96)):
+    fits = fit_windows(Curves(*given[:5]), *given[5:], 31, 1.96, make_submodels())
+    for number, expected in enumerate(fits):
         assert np.isfinite(expected).any()
         largest = np.nanmax(abs(expected), axis=0)
         np.testing.assert_allclose(
