@@ -97,32 +97,6 @@ def integrate(x, offset, starts, stops, theta):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def integrate_two(x, offset, starts, stops, high, low):  # type: ignore[no-untyped-def]
-    """Integrate to about 32 digits as a sum of two doubles (two-sum of Knuth)."""
-    total = 0.0
-    remainder = 0.0
-    high[:] = 0.0
-    low[:] = 0.0
-    done = 0
-    for r in range(starts.size):
-        high[done + 1 : starts[r] + 1] = total
-        low[done + 1 : starts[r] + 1] = remainder
-        for i in range(starts[r], stops[r]):
-            value = x[i] - offset
-            part = value - x[i]
-            small = (x[i] - (value - part)) - (offset + part)
-            new = total + value
-            part = new - total
-            remainder += ((total - (new - part)) + (value - part)) + small
-            total = new
-            high[i + 1] = total
-            low[i + 1] = remainder
-        done = stops[r]
-    high[done + 1 :] = total
-    low[done + 1 :] = remainder
-
-
-@njit(**KERNEL)
 def sum_two(high, low):  # type: ignore[no-untyped-def]
     """Replace numbers of two doubles by the sums of those before them, the last by that of all."""
     total = 0.0
@@ -134,6 +108,20 @@ def sum_two(high, low):  # type: ignore[no-untyped-def]
         part = new - total
         remainder += ((total - (new - part)) + (value - part)) + small
         total = new
+
+
+@njit(**KERNEL)
+def integrate_two(x, offset, starts, stops, high, low):  # type: ignore[no-untyped-def]
+    """Integrate to about 32 digits as a sum of two doubles (two-sum of Knuth)."""
+    high[:] = 0.0
+    low[:] = 0.0
+    for r in range(starts.size):
+        for i in range(starts[r], stops[r]):
+            value = x[i] - offset
+            part = value - x[i]
+            high[i] = value
+            low[i] = (x[i] - (value - part)) - (offset + part)
+    sum_two(high, low)
 
 
 @njit(**KERNEL)
