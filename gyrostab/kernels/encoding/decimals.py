@@ -87,12 +87,8 @@ def read_decimal(text, at, point):  # type: ignore[no-untyped-def]
         while text[first] == _ZERO or text[first] == point:  # zeros in front do not count
             count -= text[first] == _ZERO
             first += 1
-    return (
-        negative,
-        mantissa,
-        decimals,
-        at if 0 < count <= _DIGITS or (count == 0 and decimals > 0) else np.int64(-1),
-    )
+    is_number = 0 < count <= _DIGITS or (count == 0 and decimals > 0)
+    return negative, mantissa, decimals, at if is_number else np.int64(-1)
 
 
 @njit(**INNER)

@@ -70,15 +70,9 @@ class _Fit(NamedTuple):
 @njit(**INNER)
 def _make_cells(size):  # type: ignore[no-untyped-def]
     return _Cells(
-        eights(WIDTH * size),
-        eights(WIDTH * size),
-        eights(size),
-        eights(size),
-        eights(_ONE),
-        eights(size),
-        eights(size),
-        eights(_TERMS),
-    )
+        eights(WIDTH * size), eights(WIDTH * size), eights(size), eights(size), eights(_ONE),
+        eights(size), eights(size), eights(_TERMS),
+    )  # fmt: skip
 
 
 @njit(**INNER)
@@ -192,11 +186,8 @@ def _factor_covariance(cells, basis, state, units, roots, augmented, tables):  #
             at, y = width * i, take(cells.avar, i)
             diagonal = take(augmented, at + i)
             # the second part keeps a window without any noise solvable
-            put(
-                augmented,
-                at + i,
-                where_above(y, 0.0, diagonal + jitter * diagonal + 1e-16 * y * y, 1.0),
-            )
+            raised = diagonal + jitter * diagonal + 1e-16 * y * y
+            put(augmented, at + i, where_above(y, 0.0, raised, 1.0))
             for a in range(WIDTH):
                 put(augmented, at + n + a, take(system, WIDTH * i + a))
         eliminate(augmented, n, width, state[3:4])

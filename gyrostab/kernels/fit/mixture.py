@@ -181,11 +181,8 @@ def root_squares(squares, responses, units, roots):  # type: ignore[no-untyped-d
     r4 = root(take(squares, 4))
     for i in range(responses.shape[0] // 6):
         put(roots, 5 * i, r0 * take(units, 5 * i))
-        put(
-            roots,
-            5 * i + 1,
-            root(s1 * take(responses, 6 * i + 1) + s0 * take(responses, 6 * i + 2)),
-        )
+        white = s1 * take(responses, 6 * i + 1) + s0 * take(responses, 6 * i + 2)
+        put(roots, 5 * i + 1, root(white))
         put(roots, 5 * i + 2, r2 * take(units, 5 * i + 2))
         put(roots, 5 * i + 3, r3 * take(units, 5 * i + 3))
         put(roots, 5 * i + 4, r4 * take(units, 5 * i + 4))

@@ -128,31 +128,17 @@ def _seed_hypotheses(table, level, phase, first, max_lost):  # type: ignore[no-u
     if not np.isnan(first):
         for lost in range(1, 1 + _EARLY_LOSSES):
             size = _keep_hypothesis(table, size, level - lost, phase, 0.0, np.int64(0))
-        if np.rint(first - phase) <= max_lost:
-            size = _keep_hypothesis(
-                table, size, np.rint(first - phase), phase, LOSS_NATS, np.int64(0)
-            )  # or many, just after the first
+        many = np.rint(first - phase)  # or just after the first
+        if many <= max_lost:
+            size = _keep_hypothesis(table, size, many, phase, LOSS_NATS, np.int64(0))
     return size
 
 
 @njit(**KERNEL)
 def trace(  # type: ignore[no-untyped-def]
-    count,
-    stamps,
-    count0,
-    stamp0,
-    period,
-    sigma,
-    gain,
-    hold,
-    max_lost,
-    loss_nats,
-    level0,
-    phase0,
-    averaged_rows,
-    levels,
-    phases,
-):
+    count, stamps, count0, stamp0, period, sigma, gain, hold, max_lost, loss_nats, level0, phase0,
+    averaged_rows, levels, phases,
+):  # fmt: skip
     """Find the most likely course of the stamps of rows.
 
     Parameters
@@ -207,18 +193,9 @@ def trace(  # type: ignore[no-untyped-def]
         new_size = np.int64(0)
         for h in range(size):
             new_size = _extend_hypothesis(
-                new,
-                new_size,
-                old,
-                h,
-                position,
-                following,
-                sigma,
-                follows,
-                hold,
-                max_lost,
+                new, new_size, old, h, position, following, sigma, follows, hold, max_lost,
                 loss_nats,
-            )
+            )  # fmt: skip
         size = _prune_hypotheses(new, new_size, loss_nats) if new_size > 1 else new_size
         for h in range(size):
             table[i, h, 0], table[i, h, 1], parents[i, h] = new[h, 0], new[h, 1], np.int8(new[h, 3])

@@ -24,21 +24,8 @@ _EXCHANGED = 0.25  # of the stamp of an exchanged row from its sample: half of w
 _ON_TIME, _BY_COUNT, DUPLICATE, OUT_OF_ORDER, STEP, RESTART = 0, 1, 2, 3, 5, 6
 
 # places in the state: integers and stamps
-(
-    _HEAD,
-    _ROW,
-    _RUN_GRID,
-    _RUN_ROW,
-    _RUN_LENGTH,
-    _PENDING,
-    _PENDING_ROW,
-    _GRID0,
-    _STAMP0,
-    _LATEST,
-    FIRST,
-    STARTED,
-    _PHASE,
-) = range(13)
+_HEAD, _ROW, _RUN_GRID, _RUN_ROW, _RUN_LENGTH, _PENDING, _PENDING_ROW = range(7)
+_GRID0, _STAMP0, _LATEST, FIRST, STARTED, _PHASE = range(7, 13)
 #: Where the state keeps the run that is still open: first sample, first row, length.
 OPEN_RUN = slice(_RUN_GRID, _RUN_LENGTH + 1)
 _RING = 1 << 14
@@ -384,15 +371,8 @@ def place(rows, stamps, n, period, hold, max_gap, state, ring):  # type: ignore[
         head = state[_HEAD]
         verdict, target = _judge_row(stamps, j, position, period, hold, max_gap, state, ring)
         if verdict > _BY_COUNT:
-            n_events = _note_event(
-                events,
-                n_events,
-                verdict,
-                head + 1 if verdict >= STEP else target,
-                row,
-                state[_LATEST],
-                stamp,
-            )
+            sample = head + 1 if verdict >= STEP else target
+            n_events = _note_event(events, n_events, verdict, sample, row, state[_LATEST], stamp)
         if verdict >= STEP:
             state[_GRID0] = target
             state[_STAMP0] = _estimate_origin(stamps, j, period)

@@ -98,13 +98,8 @@ def project_out(laws: Laws, nuisance: Array) -> Laws:
     q, r = np.linalg.qr(laws.whiten @ nuisance)
     free = laws.whiten - q @ (np.swapaxes(q, 1, 2) @ laws.whiten)
     log_h = 2.0 * np.log(np.abs(np.diagonal(r, axis1=1, axis2=2))).sum(axis=1)
-    return Laws(
-        laws.factor,
-        free,
-        laws.log_det + log_h,
-        laws.prior,
-        nuisance.shape[0] - nuisance.shape[1] - 1,
-    )
+    freedom = nuisance.shape[0] - nuisance.shape[1] - 1
+    return Laws(laws.factor, free, laws.log_det + log_h, laws.prior, freedom)
 
 
 def fit_lags(laws: Laws, series: Array, driver: Array) -> LagFit:
