@@ -81,23 +81,22 @@ def _sum_squares(theta, a, b, k, order):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _differences_two(high, low, a, b, k, out):  # type: ignore[no-untyped-def]
-    """Compute second differences of an angle held as two doubles, without reassociation."""
-    h0, h1, h2 = high[a:b], high[a + k : b + k], high[a + 2 * k : b + 2 * k]
-    l0, l1, l2 = low[a:b], low[a + k : b + k], low[a + 2 * k : b + 2 * k]
-    for i in range(h0.size):
-        out[i] = ((h2[i] - h1[i]) - (h1[i] - h0[i])) + ((l2[i] - l1[i]) - (l1[i] - l0[i]))
+def _form_difference(first, middle, last, beyond, order):  # type: ignore[no-untyped-def]
+    """Second or third difference, without reassociation."""
+    if order == 3:
+        return (beyond - first) - 3.0 * (last - middle)
+    return (last - middle) - (middle - first)
 
 
 @njit(**INNER)
-def _third_differences_two(high, low, a, b, k, out):  # type: ignore[no-untyped-def]
-    """Compute third differences of an angle held as two doubles, without reassociation."""
-    h0, h1, h2 = high[a:b], high[a + k : b + k], high[a + 2 * k : b + 2 * k]
-    l0, l1, l2 = low[a:b], low[a + k : b + k], low[a + 2 * k : b + 2 * k]
-    h3, l3 = high[a + 3 * k : b + 3 * k], low[a + 3 * k : b + 3 * k]
+def _differences_two(high, low, a, b, k, order, out):  # type: ignore[no-untyped-def]
+    """Compute differences of an angle held as two doubles."""
+    c, d = a + 2 * k, a + order * k
+    h0, h1, h2, h3 = high[a:b], high[a + k :], high[c:], high[d:]
+    l0, l1, l2, l3 = low[a:b], low[a + k :], low[c:], low[d:]
     for i in range(h0.size):
-        high_part = (h3[i] - h0[i]) - 3.0 * (h2[i] - h1[i])
-        out[i] = high_part + ((l3[i] - l0[i]) - 3.0 * (l2[i] - l1[i]))
+        high_part = _form_difference(h0[i], h1[i], h2[i], h3[i], order)
+        out[i] = high_part + _form_difference(l0[i], l1[i], l2[i], l3[i], order)
 
 
 @njit(fastmath=REORDER, **INNER)
@@ -116,10 +115,7 @@ def _energy_two(high, low, a, b, k, order):  # type: ignore[no-untyped-def]
     total = 0.0
     for begin in range(a, b, 2048):
         part = buffer[: min(2048, b - begin)]
-        if order == 3:
-            _third_differences_two(high, low, begin, begin + part.size, k, part)
-        else:
-            _differences_two(high, low, begin, begin + part.size, k, part)
+        _differences_two(high, low, begin, begin + part.size, k, order, part)
         total += _square_sum(part)
     return total
 
