@@ -86,7 +86,10 @@ def _compute_unit(
     first = np.arange(lines.shape[1]) * unit.step
     native = convert_to_native(x)
     outliers = count_outliers(native, first, unit.window)
-    edges = gap_edge_ratio(native, first, unit.window)
+    edges = np.full(first.size, np.nan)
+    if (lines[1] < 1.0).any():
+        windows = {"window": unit.window, "step": unit.step, "n_windows": first.size}
+        edges = gap_edge_ratio(native, **windows)
     fields = [*cells, estimate_freedoms(cells, tables)]
     return fields, np.vstack([lines, outliers, edges])
 

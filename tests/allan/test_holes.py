@@ -70,7 +70,7 @@ def test_edge_ratio_equals_its_definition_and_ignores_gaps_outside_the_window():
     rng = np.random.default_rng(8)
     x = rng.normal(size=3000)
     x[::150] = x[1000:1040] = np.nan
-    ratios = gap_edge_ratio(x, np.array([300, 500]), 2000)
+    ratios = gap_edge_ratio(x[300:], window=2000, step=200, n_windows=2)
     for start, ratio in zip((300, 500), ratios, strict=True):
         part = x[start : start + 2000]
         near_gaps, elsewhere = [], []
@@ -80,7 +80,10 @@ def test_edge_ratio_equals_its_definition_and_ignores_gaps_outside_the_window():
             if np.isfinite(second):
                 (near_gaps if np.isnan(around).any() else elsewhere).append(second)
         assert ratio == pytest.approx(np.mean(near_gaps) / np.mean(elsewhere), rel=1e-12)
-    assert np.isnan(gap_edge_ratio(np.arange(3000), np.array([0]), 3000)[0])  # integers
+    x[400] = 1e30  # in the first window only
+    assert gap_edge_ratio(x[300:], window=2000, step=200, n_windows=2)[1] == ratios[1]
+    integers = gap_edge_ratio(np.arange(3000), window=3000, step=1, n_windows=1)
+    assert np.isnan(integers).all()
 
 
 def test_an_infinite_sample_is_a_missing_one():

@@ -23,6 +23,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from gyrostab.kernels.allan.blocks import windows_from_blocks
 from gyrostab.kernels.compiled import INNER, KERNEL
 
 LIMIT_SIGMA = 8.0
@@ -164,17 +165,38 @@ def count_outliers(x: NDArray[Any], starts: NDArray[np.int64], length: int) -> N
 
 
 @njit(**KERNEL)
-def gap_edge_ratio(x, starts, length):  # type: ignore[no-untyped-def]
+def _edge_blocks(x, step, head, out):  # type: ignore[no-untyped-def]
+    """Sum and count absolute second differences near gaps and elsewhere, (2, n_blocks, 4)."""
+    reach = EDGE_SAMPLES + 1
+    missing = 0  # within `reach` of the difference
+    for i in range(2 * reach):
+        missing += 0 if np.isfinite(x[i]) else 1
+    for block in range(out.shape[1]):
+        for half in range(2):
+            begin, end = block * step + half * head, block * step + (step if half else head)
+            for i in range(begin, min(end, x.size - 2 * reach)):
+                part = x[i : i + 2 * reach + 1]
+                missing += 0 if np.isfinite(part[2 * reach]) else 1
+                before, after = np.float64(part[reach - 1]), np.float64(part[reach + 1])
+                difference = abs(before - 2.0 * np.float64(part[reach]) + after)
+                if np.isfinite(difference):
+                    kind = 0 if missing > 0 else 1
+                    out[half, block, kind] += difference
+                    out[half, block, 2 + kind] += 1.0
+                missing -= 0 if np.isfinite(part[0]) else 1
+
+
+def gap_edge_ratio(
+    x: NDArray[Any], *, window: int, step: int, n_windows: int
+) -> NDArray[np.float64]:
     """Compute the ratio of mean absolute second differences next to gaps and elsewhere.
 
     Parameters
     ----------
     x : ndarray, shape (n_samples,)
         Samples, NaN where missing; rates, or cumulative angles.
-    starts : ndarray of int64, shape (n_windows,)
-        First sample of each window.
-    length : int
-        Samples of a window.
+    window, step, n_windows : int
+        Windows start at samples 0, step, 2 step ...
 
     Returns
     -------
@@ -182,39 +204,15 @@ def gap_edge_ratio(x, starts, length):  # type: ignore[no-untyped-def]
         NaN with fewer than `MIN_DIFFERENCES` of either kind. A gap outside the window has no
         effect.
     """
-    out = np.full(starts.size, np.nan)
-    missing = 0
-    for i in range(x.size):
-        missing += 0 if np.isfinite(x[i]) else 1
-    if missing == 0:
-        return out
-    total = np.zeros((x.size + 1, 2))  # sums and counts before each sample: near gaps, elsewhere
-    count = np.zeros((x.size + 1, 2), np.int32)
-    first = 0
-    while first < x.size:
-        last = first
-        while last < x.size and np.isfinite(x[last]):
-            last += 1
-        for i in range(first + 1, last - 1):
-            difference = abs(np.float64(x[i - 1]) - 2.0 * np.float64(x[i]) + np.float64(x[i + 1]))
-            early = first > 0 and i - 1 - first < EDGE_SAMPLES
-            late = last < x.size and last - (i + 2) < EDGE_SAMPLES
-            kind = 0 if early or late else 1
-            total[i + 1, kind] = difference
-            count[i + 1, kind] = 1
-        first = last + 1
-    for i in range(x.size):
-        for kind in range(2):
-            total[i + 1, kind] += total[i, kind]
-            count[i + 1, kind] += count[i, kind]
-    for window in range(starts.size):
-        low = starts[window] + EDGE_SAMPLES + 1
-        high = starts[window] + length - EDGE_SAMPLES - 1
-        if high <= low or high > x.size:
-            continue
-        near_gaps, elsewhere = count[high] - count[low]
-        if min(near_gaps, elsewhere) >= MIN_DIFFERENCES:
-            sums = total[high] - total[low]
-            if sums[1] > 0.0:
-                out[window] = (sums[0] / near_gaps) / (sums[1] / elsewhere)
-    return out
+    length = window - 2 * (EDGE_SAMPLES + 1)
+    sums = np.zeros((n_windows, 4))
+    if length > 0:
+        whole_blocks, head = divmod(length, step)
+        blocks = np.zeros((2, n_windows + whole_blocks, 4))
+        _edge_blocks(x, step, head, blocks)
+        windows_from_blocks(*blocks, np.full(4, whole_blocks), sums)
+    near_gaps, elsewhere, *counts = sums.T
+    enough = np.minimum(*counts) >= MIN_DIFFERENCES
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = near_gaps / counts[0] / (elsewhere / counts[1])
+    return np.where(enough & (elsewhere > 0.0), ratio, np.nan)
