@@ -90,25 +90,15 @@ def estimate_bounds(estimate, null, linear, square, scores):  # type: ignore[no-
     return out
 
 
-def chi_square_quantile(freedom: Floats, quantile: tuple[float, float, Floats]) -> Floats:
-    """Interpolate the quantile of chi-square over its degrees of freedom nu, by a cubic.
+def chi_square_quantile(freedom: Floats, quantile: tuple[Floats, Floats]) -> Floats:
+    """Interpolate the quantile q of chi-square over its degrees of freedom nu.
 
-    `quantile` has the first ln nu, the step of ln nu, and ``nu ln q(nu)``, which is smooth from few
-    degrees of freedom to many; nu must not be above the last node but two. Zero below the table,
-    where the quantile is below the smallest number, and without degrees of freedom.
+    `quantile` has the nodes ln nu and ``nu ln q(nu)``, which is smooth from few degrees of freedom
+    to many; nu must not be above the last. Zero below the table, where q is below the smallest
+    number, and without degrees of freedom.
     """
-    start, step, curve = quantile
     with np.errstate(divide="ignore", invalid="ignore"):
-        position = np.nan_to_num((np.log(freedom) - start) / step, nan=-1.0, neginf=-1.0)
-    i = np.clip(position.astype(np.int64), 1, curve.size - 3)
-    t = position - i
-    before, lower, upper, beyond = (curve[i + by] for by in (-1, 0, 1, 2))
-    value = (
-        -t * (t - 1.0) * (t - 2.0) / 6.0 * before + (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0 * lower
-    )
-    value += -(t + 1.0) * t * (t - 2.0) / 2.0 * upper + (t + 1.0) * t * (t - 1.0) / 6.0 * beyond
-    inside = t >= -1.0
-    return np.where(inside, np.exp(value / np.where(inside, freedom, np.inf)), 0.0)
+        return np.exp(np.interp(np.log(freedom), *quantile, left=-np.inf) / freedom)
 
 
 def cell_limits(
@@ -120,7 +110,7 @@ def cell_limits(
     ks: Floats,
     span: Floats,
     max_freedom: float,
-    quantile: tuple[float, float, Floats],
+    quantile: tuple[Floats, Floats],
 ) -> Floats:
     """Find the upper limit of each squared coefficient from one cell, at least its own part.
 
