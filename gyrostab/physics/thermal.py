@@ -19,6 +19,15 @@ _NO_LAG_S = 1e-3
 _SENSOR_LAGS_S = np.array([0.0, 20.0, 60.0])
 
 
+def _true_temperature(sensor_lag: float, chunk: Chunk, last: float | None) -> tuple[Array, Any]:
+    """Return the temperature ahead of a lagging sensor, and the last reading of the chunk."""
+    reading = np.ascontiguousarray(chunk.drivers["temperature"])
+    if not (sensor_lag and chunk.size):
+        return reading, last
+    change = np.diff(reading, prepend=reading[0] if last is None else last) * chunk.rate
+    return reading + sensor_lag * change, float(reading[-1])
+
+
 @dataclass(frozen=True, kw_only=True)
 class TemperatureBias(Effect):
     """Bias that follows the temperature without delay.
@@ -69,12 +78,8 @@ class TemperatureBias(Effect):
         return self.needs() if self.sensor_lag else ()
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
-        temperature = chunk.drivers["temperature"]
+        temperature, state = _true_temperature(self.sensor_lag, chunk, state)
         above = temperature - self.reference
-        if self.sensor_lag and chunk.size:
-            previous = float(temperature[0]) if state is None else state
-            above = above + self.sensor_lag * np.diff(temperature, prepend=previous) * chunk.rate
-            state = float(temperature[-1])
         return above * (self.sensitivity + above * (self.quadratic + above * self.cubic)), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
@@ -335,7 +340,8 @@ class ThermalHysteresis(Effect):
     moves inside of the dead band, and is dragged along by T otherwise.
 
     After a reversal, b changes from -a w (falling T) to a w (rising T) over the first 2 w, whatever
-    the speed; at the start it is zero.
+    the speed; at the start it is zero. With a sensor that lags the gyro by ``sensor_lag``, T is the
+    channel plus ``sensor_lag`` times its rate of change.
 
     References
     ----------
@@ -366,6 +372,9 @@ class ThermalHysteresis(Effect):
     width: float = parameter(
         "degC", "half of the dead band", default=3.0, low=0.0, high=500.0, difference=True
     )
+    sensor_lag: float = parameter(
+        "s", "lag of the temperature sensor behind the gyro", default=0.0, low=0.0, high=HOUR
+    )
 
     def courses(self) -> tuple[str, ...]:
         """List the temperature, because its extremes would be those of the noise."""
@@ -374,18 +383,23 @@ class ThermalHysteresis(Effect):
     def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
         from gyrostab.kernels.thermal import apply_dead_band
 
-        temperature = np.ascontiguousarray(chunk.drivers["temperature"])
-        if not chunk.size:
-            return np.zeros(0), state
-        follower, state = apply_dead_band(
-            temperature, self.width, float(temperature[0]) if state is None else state
-        )
-        return self.sensitivity * (temperature - follower), state
+        # behind a lagging sensor, the temperature is known from the second reading on
+        begin = 1 if state is None and self.sensor_lag else 0
+        lagged, follower = (None, None) if state is None else state
+        temperature, lagged = _true_temperature(self.sensor_lag, chunk, lagged)
+        bias, known = np.zeros(chunk.size), temperature[begin:]
+        if known.size:
+            first = float(known[0]) if follower is None else follower
+            follower_course, follower = apply_dead_band(known, self.width, first)
+            bias[begin:] = self.sensitivity * (known - follower_course)
+        return bias, (lagged, follower) if chunk.size else state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Array]:
         """List dead bands up to a third of the range of the temperature."""
         return {
-            "width": np.ptp(windows.drivers["temperature"]) * np.array([0.01, 0.03, 0.1, 0.2, 0.33])
+            "width": np.ptp(windows.drivers["temperature"])
+            * np.array([0.01, 0.03, 0.1, 0.2, 0.33]),
+            "sensor_lag": _SENSOR_LAGS_S,
         }
 
     def explain(self, windows: Windows) -> Prediction:
@@ -393,10 +407,14 @@ class ThermalHysteresis(Effect):
         from gyrostab.kernels.thermal import mean_dead_band_distance
 
         at, temperature = windows.course("temperature")
+        if self.sensor_lag:
+            temperature = temperature + self.sensor_lag * np.gradient(temperature, at)
         apart = mean_dead_band_distance(at, temperature, windows.begin, windows.end, self.width)
         return Prediction(mean={"sensitivity": apart})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         size, width = self.quantity("sensitivity", errors), self.quantity("width", errors)
         band = f"within a dead band of {width} to each side"
+        if self.sensor_lag:
+            band += f", measured by a sensor that lags by {self.quantity('sensor_lag', errors)}"
         return f"The bias has a temperature hysteresis {self.on_axes()}, of {size} {band}."

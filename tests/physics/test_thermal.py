@@ -123,18 +123,25 @@ def test_lagged_temperature_bias_equals_two_effects():
 
 
 @pytest.mark.parametrize("cuts", [(), (1, 1000, 3001)])
-def test_bias_behind_a_lagging_sensor_is_that_of_the_true_temperature(cuts):
-    """A sensor with a lag of 40 s sees a ramp that ends after 300 s."""
+@pytest.mark.parametrize("name", ["temperature_bias", "thermal_hysteresis"])
+def test_bias_behind_a_lagging_sensor_is_that_of_the_true_temperature(name, cuts):
+    """A sensor with a lag of 40 s sees a ramp up to 300 s, and down from there."""
     rate, late, v = 10.0, 40.0, 2.0
     t = np.arange(6000) / rate
-    true = 20.0 + v / 60.0 * np.minimum(t, 300.0)
+    true = 20.0 + v / 60.0 * (300.0 - np.abs(t - 300.0))
     after = np.maximum(t - 300.0, 0.0)
-    reading = true - v / 60.0 * late * (np.exp(-after / late) - np.exp(-t / late))
-    table = {"name": "temperature_bias", "sensitivity": 0.02, "quadratic": 0.001}
-    effect = make_effect(table | {"reference": 20.0, "sensor_lag": late})
-    expected = 0.02 * (true - 20.0) + 0.001 * (true - 20.0) ** 2
+    lags = (1.0 - np.exp(-t / late)) - 2.0 * (1.0 - np.exp(-after / late))
+    reading = true - v / 60.0 * late * lags
+    if name == "temperature_bias":
+        table = {"sensitivity": 0.02, "quadratic": 0.001, "reference": 20.0}
+        expected = 0.02 * (true - 20.0) + 0.001 * (true - 20.0) ** 2
+    else:
+        table = {"sensitivity": 0.02, "width": 1.5}
+        follower, _ = apply_dead_band(true, 1.5, 20.0)
+        expected = 0.02 * (true - follower)
+    effect = make_effect({"name": name, "sensor_lag": late, **table})
     bias = run(effect, size=t.size, rate=rate, drivers={"temperature": reading}, cuts=cuts)[0]
-    np.testing.assert_allclose(bias, expected, atol=2e-3 * expected.max())
+    np.testing.assert_allclose(bias, expected, atol=4e-3 * np.ptp(expected))
 
 
 def test_sensor_lag_is_corrected_on_a_ramp():

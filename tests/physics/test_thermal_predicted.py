@@ -76,6 +76,7 @@ def generated(effect, **noise):
             "cold": 0.5,
         },
         {"name": "thermal_hysteresis", "sensitivity": 1.0},
+        {"name": "thermal_hysteresis", "sensitivity": 1.0, "sensor_lag": 40},
         {"name": "ageing_bias", "slope": 1.0},
         {"name": "ageing_bias", "logarithmic": 1.0, "time": 0.5},
     ],
