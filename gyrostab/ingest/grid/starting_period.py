@@ -365,9 +365,10 @@ def losses_accumulate(parts: Parts) -> bool:
     if length < _MIN_SPAN_ROWS:
         return False
     spans = np.concatenate(
-        [(part[length:] - part[:-length])[::length] for part in parts if len(part) > length]
+        [part[length:] - part[:-length] for part in parts if len(part) > length]
     ).astype(np.float64)
-    usual = steps[np.abs(steps) < 50 * np.median(steps[steps > 0])]
+    longest = max(np.median(spans), np.median(np.abs(steps)))
+    usual = steps[np.abs(steps) <= longest]  # pauses, but no outages or damaged stamps
     scatter = 1.4826 * np.median(np.abs(spans - np.median(spans)))
     return bool(scatter**2 >= _MIN_ACCUMULATION * length * usual.var())
 

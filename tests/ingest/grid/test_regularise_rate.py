@@ -14,7 +14,7 @@ from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.place import place_by_stamp
 from gyrostab.ingest.grid.rate import estimate_rate
 from gyrostab.ingest.grid.regularise import regularise
-from gyrostab.ingest.grid.starting_period import sample_stretches
+from gyrostab.ingest.grid.starting_period import losses_accumulate, sample_stretches
 from gyrostab.ingest.uniform import cut_log
 from gyrostab.kernels.grid.stamps import NO_STAMP
 from gyrostab.time.grid import time_coordinate
@@ -364,6 +364,19 @@ def test_random_losses_with_jitter_do_not_change_the_rate(kind, share, jitter, u
     log = regularise(raw_log(stamps // unit * unit))
     assert log.attrs["sampling_rate_hz"] == pytest.approx(400.0, rel=1e-5)
     assert abs(log.sizes["time"] - np.ptp(samples) - 1) <= 1
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7])
+@pytest.mark.parametrize("rows", [600, 2000])
+def test_losses_accumulate_and_pauses_between_packets_do_not(share, rows):
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        samples = lose_samples("single", share, round(rows / (1 - share)), random)
+        stamps = stamps_of(samples + random.normal(0.0, 0.2, samples.size), 100.0)
+        assert losses_accumulate([stamps])
+        arrival = random.exponential(0.5, rows // 10) + 10.0 * np.arange(rows // 10)  # [samples]
+        inside = np.sort(random.uniform(0.0, 0.05, (rows // 10, 10)), axis=1)
+        assert not losses_accumulate([stamps_of((arrival[:, None] + inside).ravel(), 100.0)])
 
 
 def test_rows_lost_among_shared_stamps_make_no_rows_of_the_tick():
