@@ -29,6 +29,7 @@ from gyrostab.ingest.grid.jitter import (
 from gyrostab.ingest.grid.starting_period import (
     LONGEST,
     MIN_TICKS,
+    PEAK_WIDTH,
     SECOND,
     SHARED_SHARE,
     Integers,
@@ -146,12 +147,12 @@ def _estimate_ordered(stamps: Stamps, stretches: Parts, parts: Parts, sure: floa
         return replace(lost, even=float(f"{SECOND / time_per_row(stretches):.4g}"))
     is_uneven = step_scatter(steps, period) > _SHARP_SCATTER
     jitter: JitterModel | None = None
+    combs: list[tuple[float, float]] = []
     if counted or is_uneven or np.mean(steps == 0) >= SHARED_SHARE:
         peaks = [] if coarse else comb_peaks(parts)
-        guesses = [(period, MIN_SIGMA)]
         if peaks and losses_accumulate(parts):
-            guesses += [peak for peak in peaks if peak[0] > MIN_TICKS * clock_tick(parts)]
-        jitter = _fit_jitter(stretches, guesses, coarse, sure)
+            combs = [peak for peak in peaks if peak[0] > MIN_TICKS * clock_tick(parts)]
+        jitter = _fit_jitter(stretches, [(period, MIN_SIGMA), *combs], coarse, sure)
         if jitter is not None:
             finer_rate = _finer_rate(stretches, peaks, jitter, sure)
             estimate = _estimate_with_jitter(stamps, jitter, coarse, sure)
@@ -163,10 +164,11 @@ def _estimate_ordered(stamps: Stamps, stretches: Parts, parts: Parts, sure: floa
         estimate = _estimate_pooled(stamps, period, longest, counted=counted, coarse=coarse)
         finer_rate = None if finer is None else float(f"{SECOND / finer:.4g}")
         estimate = replace(estimate, finer=finer_rate)
+    has_comb = any(abs(SECOND / estimate.raw / comb - 1) < PEAK_WIDTH for comb, _ in combs)
     even = None if estimate.counted else packet_rate(stretches, estimate.rate)
-    if even is None or not is_uneven:
+    if even is None or not is_uneven or has_comb:
         return replace(estimate, even=even)
-    # samples have even steps, and rows that arrive in packets do not
+    # samples lie near multiples of a period across all pauses, and packets of rows do not
     period = time_per_row(stretches)
     return _estimate_pooled(stamps, period, longest_step(parts, period), counted=True)
 

@@ -27,7 +27,7 @@ _MAX_PEAKS = 3
 #: Shortest period [ticks of the clock]: of a tick all stamps are multiples, however sampled. The
 #: longest tick [ns] that is certainly one, as in stamps in milliseconds.
 MIN_TICKS, _COMMON_TICK = 1.5, 1e6
-_PEAK_WIDTH = 0.02  # relative distance of two peaks, at least
+PEAK_WIDTH = 0.02  # relative distance of two peaks, at least
 
 #: Rows over which random losses accumulate, at least and at most, and the share of the variance of
 #: independent steps below which they do not.
@@ -410,7 +410,7 @@ def comb_peaks(parts: Parts) -> list[tuple[float, float]]:
             break
         coherence = min(0.99, power[best] * rows.sum() / (rows**2).sum())
         peaks.append((1 / frequency[best], float(np.sqrt(-np.log(coherence)) / (2 * np.pi))))
-        apart = np.abs(frequency / frequency[best] - 1) > _PEAK_WIDTH
+        apart = np.abs(frequency / frequency[best] - 1) > PEAK_WIDTH
         frequency, power = frequency[apart], power[apart]
     return peaks
 
