@@ -18,9 +18,10 @@ from gyrostab.diagnose.evidence.fast_switching import (
 from gyrostab.diagnose.evidence.telegraph import (
     PARTS_PER_BLOCK,
     TelegraphCourses,
+    Visits,
+    compare_visits,
     telegraph_evidence,
 )
-from gyrostab.diagnose.evidence.visits import Visits, compare_visits
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
     CandidateEvidence,
