@@ -13,10 +13,9 @@ from gyrostab.diagnose.statistics.cross_spectrum import CrossSpectrum
 from gyrostab.diagnose.statistics.drifting_line import DriftingLine
 from gyrostab.diagnose.statistics.mean import Mean
 from gyrostab.diagnose.statistics.power import Power
-from gyrostab.diagnose.statistics.ramp_phase import RampPhase
 from gyrostab.diagnose.statistics.random_process import RandomProcess, WanderingBias
 from gyrostab.diagnose.statistics.restart import Restart
-from gyrostab.diagnose.statistics.rotation_order import RotationOrder
+from gyrostab.diagnose.statistics.rotation_order import RampPhase, RotationOrder
 from gyrostab.diagnose.statistics.sample_counts import SampleCounts
 from gyrostab.diagnose.statistics.spectral_line import SpectralLine
 from gyrostab.diagnose.statistics.telegraph import Telegraph
