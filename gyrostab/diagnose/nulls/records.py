@@ -23,7 +23,7 @@ from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.diagnose.statistics.base import NullDraw
 from gyrostab.diagnose.statistics.cross_spectrum import draw_coherency
-from gyrostab.diagnose.statistics.null_counts import COARSE_STEP_SIGMA
+from gyrostab.diagnose.statistics.sample_counts import COARSE_STEP_SIGMA
 from gyrostab.kernels.random.stochastic import (
     brownian_means,
     flicker_means,

@@ -14,7 +14,7 @@ from gyrostab.diagnose.evidence.sample_counts import hidden_by_grid
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.outliers import quantization_step
-from gyrostab.diagnose.statistics.null_counts import _chance_in_bin
+from gyrostab.diagnose.statistics.sample_counts import _chance_in_bin
 from gyrostab.ingest.make_log import make_log
 from tests.support.repetitions import first_of
 
