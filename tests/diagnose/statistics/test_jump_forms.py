@@ -9,8 +9,7 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.estimate.joint_fit import fit_identifications
-from gyrostab.diagnose.estimate.split_components import split_steps
+from gyrostab.diagnose.estimate.joint_fit import fit_identifications, split_steps
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.identifiability import find_equivalent_effects, keep_physical
