@@ -27,7 +27,6 @@ from gyrostab.diagnose.result.attribution import attribute_mismatches
 from gyrostab.diagnose.result.content import SCHEMA, check_diagnosis
 from gyrostab.diagnose.result.diagnosis import Diagnosis, plain
 from gyrostab.diagnose.result.held_out import measure_evidence
-from gyrostab.diagnose.result.mismatch_tables import mismatch_tables
 from gyrostab.diagnose.result.rejections import (
     find_rejections,
     find_unsupported,
@@ -37,6 +36,7 @@ from gyrostab.diagnose.result.surfaces import make_surfaces
 from gyrostab.diagnose.result.tables import (
     baseline_table,
     effect_tables,
+    mismatch_tables,
     model_tables,
     recording_table,
 )

@@ -17,7 +17,7 @@ from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import drop_changed_tails
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.result.mismatch_tables import identified_mismatches
+from gyrostab.diagnose.result.tables import identified_mismatches
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log

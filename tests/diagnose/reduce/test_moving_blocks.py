@@ -20,7 +20,7 @@ from gyrostab.diagnose.reduce.moving_blocks import (
     moving_blocks_of_axis,
     without_motion,
 )
-from gyrostab.diagnose.result.mismatch_tables import motion_mismatches
+from gyrostab.diagnose.result.tables import motion_mismatches
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.candidates import effect_candidates

@@ -24,9 +24,8 @@ from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.diagnose.result.finish import keep_supported, supported_axes
-from gyrostab.diagnose.result.mismatch_tables import unidentified_mismatches
 from gyrostab.diagnose.result.record_text import summary
-from gyrostab.diagnose.result.tables import effect_tables
+from gyrostab.diagnose.result.tables import effect_tables, unidentified_mismatches
 from gyrostab.diagnose.result.verdict import decide_verdict, failed_checks
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.physics.registry import effects
