@@ -10,9 +10,8 @@ import xarray as xr
 
 from gyrostab.diagnose.identify.examination import Identifications
 from gyrostab.diagnose.identify.identification import Selection
-from gyrostab.diagnose.predict.average_sizes import choose_grid
+from gyrostab.diagnose.predict.average_sizes import Point, choose_grid, refine_grid
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
-from gyrostab.diagnose.predict.grid_refinement import Point, refine_grid
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.registry import effects
