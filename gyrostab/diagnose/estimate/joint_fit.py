@@ -127,13 +127,13 @@ def _fit_identification(
     parts = (
         [
             part
-            for harmonic in split_harmonics(identification, state)
+            for harmonic in _split_harmonics(identification, state)
             for part in split_steps(harmonic, state)
         ]
         if fitted_together
         else [
             ([part for part in identification.components if set(axes) & set(part.row)], state)
-            for axes in group_axes(
+            for axes in _group_axes(
                 identification, state.blocks, identifications.examination.count_evidence
             )
         ]
@@ -349,7 +349,7 @@ def _make_estimate(
     return Estimate(mean, sd, low, high, unit)
 
 
-def split_harmonics(identification: Selection, state: State) -> list[list[Component]]:
+def _split_harmonics(identification: Selection, state: State) -> list[list[Component]]:
     """Split the components of several harmonics of the rotation, each with its amplitude and phase.
 
     Harmonics other than the strongest are dropped when their amplitude is within two standard
@@ -406,7 +406,7 @@ def split_steps(
     return out
 
 
-def group_axes(
+def _group_axes(
     identification: Selection, blocks: xr.Dataset, count_evidence: CountEvidence
 ) -> list[list[str]]:
     """Group the axes on which an effect changes samples at the same instants; others are alone."""

@@ -49,7 +49,7 @@ _MAX_COMMON_SHARE = 0.9  # of the scatter of a band that may be common with othe
 _MIN_EIGENVALUE = 1e-9  # of a coherence: with gaps it may be negative for nearly equal axes
 
 
-class SharedNoise(NamedTuple):
+class _SharedNoise(NamedTuple):
     """Noise that axes have in common."""
 
     root: Complex  # (block, band, axis, axis): square root of the coherency matrix
@@ -73,7 +73,7 @@ class _NullSetup(NamedTuple):
     # Excess kurtosis of a block beyond that of white Gaussian noise, and its scatter over that of
     # white Gaussian noise, by axis.
     tails: Array
-    shared: SharedNoise | None  # noise common to axes
+    shared: _SharedNoise | None  # noise common to axes
 
 
 def null_records(
@@ -144,7 +144,7 @@ def _prepare_nulls(
         density = np.concatenate([density, baseline["peaks"].values[..., None]], axis=-1)
     tails = np.array([_kurtosis_excess(blocks, axis_density, rng) for axis_density in density])
     ties = _common_shapes(baseline["shape_alone"].values, int(blocks.attrs["block_samples"]))
-    shared = find_shared_noise(blocks, baseline)
+    shared = _find_shared_noise(blocks, baseline)
     return _NullSetup(blocks, baseline, ties, effects, np.array(sd), tails, shared)
 
 
@@ -218,7 +218,7 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
     if setup.shared is None:
         power = _draw_gamma(baseline["shape_alone"].values, expected, rng, setup.ties)
     else:
-        power, between = draw_shared_spectra(setup.shared, count, rng)
+        power, between = _draw_shared_spectra(setup.shared, count, rng)
         power *= expected
         if "cross_error" in baseline:
             error = baseline["cross_error"].values
@@ -410,7 +410,7 @@ def _draw_kurtosis(setup: _NullSetup, count: int, rng: np.random.Generator) -> A
     return np.asarray(out)
 
 
-def find_shared_noise(blocks: xr.Dataset, baseline: xr.Dataset) -> SharedNoise | None:
+def _find_shared_noise(blocks: xr.Dataset, baseline: xr.Dataset) -> _SharedNoise | None:
     """Return the noise that axes have in common in the baseline; None without any."""
     if "cross" not in baseline:
         return None
@@ -428,7 +428,7 @@ def find_shared_noise(blocks: xr.Dataset, baseline: xr.Dataset) -> SharedNoise |
         matrix[..., a, b], matrix[..., b, a] = coherency, coherency.conj()
         white[:, a, b] = white[:, b, a] = coherency[:, 0].real * overlap
     pair_shape = blocks["cross_shape"].values
-    return SharedNoise(
+    return _SharedNoise(
         _correlation_root(matrix), pairs, axis_shape, pair_shape, _correlation_root(white)
     )
 
@@ -442,8 +442,8 @@ def _correlation_root(matrix: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(root / np.sqrt((np.abs(root) ** 2).sum(axis=-1, keepdims=True)))
 
 
-def draw_shared_spectra(
-    shared: SharedNoise, count: int, rng: np.random.Generator
+def _draw_shared_spectra(
+    shared: _SharedNoise, count: int, rng: np.random.Generator
 ) -> tuple[Array, Complex]:
     """Draw powers over their expectation, and cross-spectra over the root of both expectations.
 

@@ -24,7 +24,7 @@ from gyrostab.diagnose.statistics.sample_counts import find_anomalous_blocks, ma
 Array = NDArray[np.float64]
 MAX_SPANS = 6  # more intervals than that are reported as the whole record
 #: Name, scores and standardised scores of each statistic.
-Scores = Sequence[tuple[str, xr.Dataset, NDArray[np.float64]]]
+_Scores = Sequence[tuple[str, xr.Dataset, NDArray[np.float64]]]
 
 
 def active_blocks(
@@ -121,13 +121,13 @@ def attribute_mismatches(
     settings = null.settings
 
     @cache
-    def scores_without(out: tuple[Selection, ...]) -> Scores:
+    def scores_without(out: tuple[Selection, ...]) -> _Scores:
         remaining = [identification for identification in identified if identification not in out]
         baseline = without(out) if without is not None and out else after
-        return statistic_scores(blocks, baseline, null, located, remaining, still=still)
+        return _statistic_scores(blocks, baseline, null, located, remaining, still=still)
 
     def score_without(region: Region, out: Sequence[Selection]) -> tuple[float, float]:
-        return score_left(region, scores_without(tuple(out)), null, level)
+        return _score_left(region, scores_without(tuple(out)), null, level)
 
     when = [_explained_spans(identification, blocks, settings) for identification in identified]
     moves = [
@@ -285,7 +285,7 @@ def _moving_spans(
     ]
 
 
-def statistic_scores(
+def _statistic_scores(
     blocks: xr.Dataset,
     after: xr.Dataset,
     null: NullScores,
@@ -293,7 +293,7 @@ def statistic_scores(
     identified: Sequence[Selection],
     *,
     still: xr.Dataset | None = None,
-) -> Scores:
+) -> _Scores:
     """Score the recording against a baseline with effects.
 
     Statistics of whole blocks leave out those with anomalous samples of `identified`, and
@@ -359,8 +359,8 @@ def _with_shared_lines(
     return after.assign(cross=(("pair", "block", "band"), cross))
 
 
-def score_left(
-    region: Region, scores: Scores, null: NullScores, level: float
+def _score_left(
+    region: Region, scores: _Scores, null: NullScores, level: float
 ) -> tuple[float, float]:
     """Return the largest score left at a mismatch, and the score that still makes it one.
 

@@ -69,7 +69,7 @@ class RotationOrder(Statistic):
         blocks, expected = draw.blocks, draw.expected
         rate = float(blocks.attrs["sampling_rate_hz"])
         samples = np.maximum(blocks["order_samples"].values, 1.0)
-        turning = turns_per_second(blocks)
+        turning = _turns_per_second(blocks)
         bands = np.log(blocks["frequency"].values)
         density = np.empty((len(expected), *blocks["order"].shape))
         for place, harmonic in enumerate(blocks["harmonic"].values):
@@ -212,7 +212,7 @@ def order_weight(state: State) -> Array:
     """Return (axis, block, harmonic): one over the variance of each part of an amplitude."""
     blocks = state.blocks
     rate, frequency = float(blocks.attrs["sampling_rate_hz"]), blocks["frequency"].values
-    place = turns_per_second(blocks)[:, None] * blocks["harmonic"].values
+    place = _turns_per_second(blocks)[:, None] * blocks["harmonic"].values
     good = (
         np.isfinite(blocks["order"].values)
         & (place * float(blocks.attrs["block_s"]) >= 2.0)
@@ -281,19 +281,19 @@ def _visible_lines(line_power: Array, axis: str, state: State) -> NDArray[np.boo
     return np.asarray(line_power / noise * math.sqrt(count) >= state.settings.visible_sigma)
 
 
-def turns_per_second(blocks: xr.Dataset) -> Array:
+def _turns_per_second(blocks: xr.Dataset) -> Array:
     """Return turns per second in each block."""
     if "channel_rotation_rate" not in blocks:
         return np.zeros(blocks.sizes["block"])
     return np.asarray(np.nan_to_num(np.abs(blocks["channel_rotation_rate"].values) / 360.0))
 
 
-def score_orders(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
+def _score_orders(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
     """Return score, ratio and amplitude of the coherent sum by (record), axis, window, harmonic."""
     order = blocks["order"].values
     samples = blocks["order_samples"].values
     rate = float(blocks.attrs["sampling_rate_hz"])
-    turning, spectrum = turns_per_second(blocks), baseline["spectrum"].values
+    turning, spectrum = _turns_per_second(blocks), baseline["spectrum"].values
     bands = np.log(baseline["frequency"].values)
     log_frequency = np.log(
         np.clip(
@@ -359,10 +359,10 @@ class RampPhase(Statistic):
         kinds: list[str] = []
         tau_min, tau_max = [], []
         if "order" in blocks:
-            scored.append(score_orders(blocks, baseline, windows))
+            scored.append(_score_orders(blocks, baseline, windows))
             harmonics = range(1, blocks.sizes["harmonic"] + 1)
             kinds += [f"order {h}" for h in harmonics]
-            turning = turns_per_second(blocks)
+            turning = _turns_per_second(blocks)
             turning_blocks = turning[turning > 0]
             low, high = (
                 (float(turning_blocks.min()), float(turning_blocks.max()))

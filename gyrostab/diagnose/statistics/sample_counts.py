@@ -95,7 +95,7 @@ class SampleCounts(Statistic):
         return [Candidate("~outliers", self, (), (Variant({}, ("kurtosis",), np.empty(0)),))]
 
     def null(self, draw: NullDraw) -> Mapping[str, NDArray[Any]]:
-        return null_counts(draw.blocks, draw.sample_sd, draw.record_count, draw.rng)
+        return _draw_null_counts(draw.blocks, draw.sample_sd, draw.record_count, draw.rng)
 
     def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
         """Score counts and kurtosis in windows of three lengths and of the whole record.
@@ -307,7 +307,7 @@ def mask_anomalous_blocks(
     )
 
 
-def null_counts(
+def _draw_null_counts(
     blocks: xr.Dataset, sd: Array, count: int, rng: np.random.Generator
 ) -> dict[str, NDArray[np.int64]]:
     """Draw outliers, repeats, extremes and zeros of Gaussian noise on the quantization grid.
@@ -350,7 +350,7 @@ def _neighbour_statistics(blocks: xr.Dataset, sd: Array) -> tuple[Array, Array]:
     """Measure the scatter of the samples of each block, and the correlation of neighbours.
 
     Both (axis, block) are interpolated over blocks with losses or outliers. The standard deviations
-    are as in `null_counts`, for axes without measured powers.
+    are as in `_draw_null_counts`, for axes without measured powers.
     """
     rate = float(blocks.attrs["sampling_rate_hz"])
     low, high = blocks["band_low"].values, blocks["band_high"].values
