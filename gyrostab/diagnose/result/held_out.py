@@ -23,6 +23,7 @@ from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks
 from gyrostab.diagnose.evidence.held_out import mean_residual, noise_weight
+from gyrostab.diagnose.evidence.mixture import products_mixture
 from gyrostab.diagnose.evidence.products import axis_noise, mean_products
 from gyrostab.diagnose.identify.examination import Identifications
 from gyrostab.diagnose.identify.identification import Selection, components_of
@@ -359,24 +360,17 @@ def _mean_evidence(
 
     It is averaged over the calibrated random walk and flicker.
     """
-    residual = mean_residual(blocks, baseline, axis)[:, 0]
+    residual = mean_residual(blocks, baseline, axis)
     noise = axis_noise(baseline, axis)
-    variance = noise["variance"]
-    present = used & np.isfinite(residual) & np.isfinite(variance) & (variance > 0)
-    weight = noise_weight(baseline, axis, "calibrated")
+    variance, weight = noise["variance"], noise_weight(baseline, axis, "calibrated")
     products = mean_products(
-        np.where(present, residual, 0.0)[:, None],
-        np.empty((residual.size, 0)),
-        **noise | {"variance": np.where(present, variance, 1.0)},
+        residual,
+        np.empty((used.size, 0)),
+        **noise,
         step=float(blocks.attrs["block_s"]),
-        present=present,
+        present=used & np.isfinite(residual[:, 0]) & np.isfinite(variance) & (variance > 0),
     )
-    log = (
-        weight
-        - np.logaddexp.reduce(weight)
-        - 0.5 * (products.square[:, 0] + products.log_determinant)
-    )
-    return float(np.logaddexp.reduce(log))
+    return products_mixture(products, weight - np.logaddexp.reduce(weight)).evidence
 
 
 def _allan_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Array:
