@@ -15,7 +15,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.baseline.expected_statistics import line_columns, white_variance
+from gyrostab.diagnose.baseline.expected_statistics import (
+    line_columns,
+    sum_noise,
+    white_variance,
+)
 from gyrostab.diagnose.evidence.sample_counts import kurtosis_moments
 from gyrostab.diagnose.evidence.spectral_lines import interpolate_bands
 from gyrostab.diagnose.evidence.wandering import expected_processes
@@ -127,8 +131,7 @@ def repeatable_null_records(
 def _prepare_nulls(
     blocks: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator
 ) -> _NullSetup:
-    columns = baseline["columns"].values
-    noise = np.einsum("abfn,an->abf", columns, baseline["square"].values)
+    noise = sum_noise(baseline["columns"].values, baseline["square"].values)
     effects = baseline["spectrum"].values / noise
     lines = line_columns(blocks)
     rate = float(blocks.attrs["sampling_rate_hz"])
