@@ -52,12 +52,11 @@ def free_covariance(state: State, axes: tuple[str, ...], density: Array) -> Stat
     return state
 
 
-def bands_at(state: State, frequency: Array) -> NDArray[np.bool_]:
-    """Return the bands (block, band) of frequencies, (block,) or scalar, and adjacent ones."""
-    low, high = state.blocks["band_low"].values, state.blocks["band_high"].values
-    reach = 1.0 / float(state.blocks.attrs["block_s"])
-    place = np.broadcast_to(frequency, (state.weight.shape[1],))[:, None]
-    return (place >= low - reach) & (place < high + reach)
+def find_bands(blocks: xr.Dataset, frequency: float) -> NDArray[np.int64]:
+    """Return the indices of the bands within the resolution of a block of a frequency."""
+    reach = 1.0 / float(blocks.attrs["block_s"])
+    low, high = blocks["band_low"].values - reach, blocks["band_high"].values + reach
+    return np.flatnonzero((low <= frequency) & (frequency < high))
 
 
 def free_shape(state: State, axis: str) -> State:

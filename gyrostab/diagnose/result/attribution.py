@@ -14,7 +14,7 @@ from gyrostab.diagnose.identify.identification import Selection, components_of
 from gyrostab.diagnose.locate.mismatches import Region
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.predict.candidates import Component
-from gyrostab.diagnose.predict.condition import drop_changed_tails, mean_columns
+from gyrostab.diagnose.predict.condition import drop_changed_tails, find_bands, mean_columns
 from gyrostab.diagnose.predict.linear_model import pair_rows
 from gyrostab.diagnose.reduce.schema import weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -343,14 +343,10 @@ def _with_shared_lines(
     observed, shape = (blocks[name].values for name in ("cross", "cross_shape"))
     expected = after["cross"].values if "cross" in after else np.zeros_like(observed)
     mean, _ = weighted_mean(observed - expected, shape, axis=1)
-    reach = 1.0 / float(blocks.attrs["block_s"])
     cross = expected.copy()
     for place in {place for place, _ in lines}:
         frequency = float(blocks["line_frequency"].values[place])
-        bands = np.flatnonzero(
-            (blocks["band_low"].values <= frequency + reach)
-            & (frequency - reach < blocks["band_high"].values)
-        )
+        bands = find_bands(blocks, frequency)
         axes = {axis for line_place, axis in lines if line_place == place}
         for number, pair in enumerate(pair_rows(blocks)):
             if set(pair) <= axes:

@@ -22,7 +22,7 @@ from gyrostab.diagnose.predict.candidates import (
     Prospect,
     Variant,
 )
-from gyrostab.diagnose.predict.condition import bands_at, free_covariance
+from gyrostab.diagnose.predict.condition import find_bands, free_covariance
 from gyrostab.diagnose.predict.linear_model import (
     State,
     average_in_bands,
@@ -141,10 +141,9 @@ class SpectralLine(Statistic):
     def condition(self, state: State, component: Component) -> State:
         frequency = float(state.blocks["line_frequency"].values[component.place])
         axis = component.row[0]
-        density = bands_at(state, np.asarray(frequency)).astype(float)
         power_columns = state.power_columns(axis)
-        for band in np.flatnonzero(density.any(axis=0)):
-            column = np.zeros_like(density)
+        for band in find_bands(state.blocks, frequency):
+            column = np.zeros(state.weight.shape[1:])
             column[:, band] = 1.0
             if any(np.array_equal(column, other) for other in power_columns):
                 continue  # another line in the same band is already given
