@@ -294,21 +294,13 @@ def _score_orders(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) ->
     samples = blocks["order_samples"].values
     rate = float(blocks.attrs["sampling_rate_hz"])
     turning, spectrum = _turns_per_second(blocks), baseline["spectrum"].values
-    bands = np.log(baseline["frequency"].values)
-    log_frequency = np.log(
-        np.clip(
-            turning[:, None] * np.arange(1, order.shape[-1] + 1),
-            np.exp(bands[0]),
-            np.exp(bands[-1]),
-        )
-    )
-    density = np.empty((*spectrum.shape[:2], order.shape[-1]))
+    bands, orders = baseline["frequency"].values, np.arange(1, order.shape[-1] + 1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        for axis, block in np.ndindex(spectrum.shape[:2]):
-            density[axis, block] = np.exp(
-                np.interp(log_frequency[block], bands, np.log(spectrum[axis, block]))
-            )
-        density = noise_at_orders(blocks, density)
+        by_block = [
+            interpolate_bands(spectrum[:, block], rate_hz * orders, bands)
+            for block, rate_hz in enumerate(turning)
+        ]
+        density = noise_at_orders(blocks, np.stack(by_block, axis=1))
         # Of |order|^2: two parts of 2 S rate / n each.
         variance = 4.0 * density * rate / samples
         present = (
