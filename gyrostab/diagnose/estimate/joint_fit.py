@@ -436,9 +436,9 @@ def _group_steps(steps: Sequence[Component], state: State) -> list[list[Componen
     middle = (state.blocks["begin"].values + state.blocks["end"].values) / 2.0
     present = np.isfinite(state.blocks["mean"].values).any(axis=0)
     groups: list[list[Component]] = []
-    for step in sorted(steps, key=_step_time):
+    for step in sorted(steps, key=lambda step: step.step_time):
         if groups:
-            between = (middle > _step_time(groups[-1][0])) & (middle < _step_time(step))
+            between = (middle > groups[-1][0].step_time) & (middle < step.step_time)
             is_other = (present & between).sum() > MAX_BLOCKS_OF_STEP
             if not is_other and all(step.row != other.row for other in groups[-1]):
                 groups[-1].append(step)
@@ -449,11 +449,11 @@ def _group_steps(steps: Sequence[Component], state: State) -> list[list[Componen
 
 def _nearest_times(step: Component, others: Sequence[Component]) -> Component:
     """Return a step with only those times that are nearer to it than to others of its axis."""
-    other_times = [_step_time(other) for other in others if other.row == step.row]
+    other_times = [other.step_time for other in others if other.row == step.row]
 
     def is_nearest(variant: Variant) -> bool:
         time = float(variant.values[TIME_PARAMETER])
-        return all(abs(time - _step_time(step)) < abs(time - other) for other in other_times)
+        return all(abs(time - step.step_time) < abs(time - other) for other in other_times)
 
     nearest = tuple(filter(is_nearest, step.candidate.variants))
     return replace(step, candidate=replace(step.candidate, variants=nearest))
@@ -476,7 +476,3 @@ def _single_steps(component: Component) -> list[Component]:
         for other in single
         if np.array_equal(other.design[0], column)
     ]
-
-
-def _step_time(component: Component) -> float:
-    return float(component.variant.values[TIME_PARAMETER])

@@ -144,6 +144,11 @@ class Component:
         return self.statistic.is_linear_in_means and TIME_PARAMETER in self.variant.values
 
     @property
+    def step_time(self) -> float:
+        """Time of a step [s]."""
+        return float(self.variant.values[TIME_PARAMETER])
+
+    @property
     def is_filter(self) -> bool:
         """Whether the effect multiplies the spectrum rather than adds to it."""
         return self.candidate.statistic.is_filter(self.variant)

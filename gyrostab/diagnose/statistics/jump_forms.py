@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.predict.candidates import TIME_PARAMETER, Component, Variant
+from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture, mean_mixture
@@ -28,8 +28,7 @@ def is_free_jump(component: Component, state: State) -> bool:
     """Return whether a component is a jump at a free instant, not at a restart."""
     if component.candidate.effect != _JUMP or not component.is_step:
         return False
-    time = float(component.variant.values[TIME_PARAMETER])
-    return not np.isclose(state.blocks["restart_end"].values, time).any()
+    return not np.isclose(state.blocks["restart_end"].values, component.step_time).any()
 
 
 def jump_competitors(
@@ -55,7 +54,7 @@ def jump_competitors(
     step = sum(component_mixture(jump, state).evidence for jump in jumps)
     block = float(state.blocks.attrs["block_s"])
     middle = (np.arange(state.blocks.sizes["block"]) + 0.5) * block
-    after = [middle - float(jump.variant.values[TIME_PARAMETER]) for jump in jumps]
+    after = [middle - jump.step_time for jump in jumps]
     gradual = max(
         _sum_evidence(
             jumps, state, [np.clip(time / (length * block) + 0.5, 0.0, 1.0) for time in after]
@@ -151,7 +150,7 @@ def _possible_variances(component: Component, state: State) -> list[Array]:
     axis, block_count = component.row[0], state.blocks.sizes["block"]
     block = np.arange(block_count)
     block_s = float(state.blocks.attrs["block_s"])
-    at = round(float(component.variant.values[TIME_PARAMETER]) / block_s)
+    at = round(component.step_time / block_s)
     lengths = [2**power for power in range(1, max(block_count, 2).bit_length())]
     spans = {
         (max(at - blocks_before, 0), min(at + blocks_after, block_count))
@@ -174,7 +173,7 @@ def _possible_variances(component: Component, state: State) -> list[Array]:
 def _event_spans(component: Component, state: State) -> list[tuple[int, int]]:
     """Return the first and last edges of events that begin or end at a jump."""
     block, block_count = float(state.blocks.attrs["block_s"]), state.blocks.sizes["block"]
-    at = round(float(component.variant.values[TIME_PARAMETER]) / block)
+    at = round(component.step_time / block)
     lengths = np.unique(
         np.geomspace(
             2.0,
