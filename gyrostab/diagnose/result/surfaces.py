@@ -74,7 +74,7 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
     ]
     step = -(-blocks.sizes["line"] // MAX_LINES)
     lines = blocks["line_power"].weighted(blocks["line_weight"].fillna(0.0)).mean("part")
-    coarse = {"line": step}
+    highest = lines.coarsen(line=step, boundary="trim").max()
     arrays: dict[str, Any] = {
         "avar": np.stack(np.broadcast_arrays(*avar)),
         "avar_low": np.stack(np.broadcast_arrays(*low)),
@@ -82,7 +82,7 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
         "mean": np.stack(mean),
         "mean_stderr": np.stack(np.broadcast_arrays(*error)),
         "density": np.stack(density),
-        "line_density": lines.coarsen(coarse, boundary="trim").max().values,
+        "line_density": highest.values,
         "time": start + np.rint((begin + end) / 2.0 * 1e9).astype("timedelta64[ns]"),
         "begin": begin,
         "end": end,
@@ -97,10 +97,7 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
             "block_begin": blocks["begin"].variable,
             "block_end": blocks["end"].variable,
             "frequency": blocks["frequency"].variable,
-            "line_frequency": blocks["line_frequency"]
-            .coarsen(coarse, boundary="trim")
-            .mean()
-            .variable,
+            "line_frequency": highest["line_frequency"].variable,
         },
         attrs={name: blocks.attrs[name] for name in _ATTRIBUTES if name in blocks.attrs},
     ).assign(block_mean=blocks["mean"].variable)
