@@ -72,6 +72,7 @@ def allan_surface(
     return joined
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def _surface_within_blocks(
     blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
 ) -> dict[str, Any]:
@@ -84,9 +85,8 @@ def _surface_within_blocks(
         blocks["band_low"].values, blocks["band_high"].values, k / rate, rate
     ).T
     present = np.isfinite(power) & np.isfinite(spectrum) & (shape > 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = np.where(present, 1.0 / shape, 0.0)
-        relative = np.where(present, power / spectrum * shape, 0.0).sum(axis=-1, keepdims=True)
+    inverse = np.where(present, 1.0 / shape, 0.0)
+    relative = np.where(present, power / spectrum * shape, 0.0).sum(axis=-1, keepdims=True)
     power = np.where(present, power, 0.0)
     spectrum = np.where(present, spectrum, 0.0)
     used_shape = np.where(present, shape, 0.0)
@@ -97,18 +97,17 @@ def _surface_within_blocks(
         np.concatenate([(spectrum**2 * inverse) @ weights**2, total], axis=-1), windows
     )
     count = sum_over_windows(present.any(axis=-1, keepdims=True).astype(float), windows)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        gamma = np.where(count >= 0.25 * windows.length[:, None], expected**2 / variance, np.nan)
-        return {
-            "observed": observed / count,
-            "expected": expected / count,
-            "shape": gamma,
-            "columns": {
-                "what": np.array(["avar"] * k.size + ["level"], dtype="<U8"),
-                "tau_min_s": np.append(k / rate, 1.0 / rate),
-                "tau_max_s": np.append(k / rate, k[-1] / rate),
-            },
-        }
+    gamma = np.where(count >= 0.25 * windows.length[:, None], expected**2 / variance, np.nan)
+    return {
+        "observed": observed / count,
+        "expected": expected / count,
+        "shape": gamma,
+        "columns": {
+            "what": np.array(["avar"] * k.size + ["level"], dtype="<U8"),
+            "tau_min_s": np.append(k / rate, 1.0 / rate),
+            "tau_max_s": np.append(k / rate, k[-1] / rate),
+        },
+    }
 
 
 def _surface_of_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict[str, Any]:

@@ -203,6 +203,7 @@ class CrossSpectrum(Statistic):
         )
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def _pair_coherency(
     blocks: xr.Dataset,
     baseline: xr.Dataset,
@@ -220,10 +221,9 @@ def _pair_coherency(
         cross = cross - baseline["cross"].values
     power, shape = blocks["power"].values, blocks["shape"].values
     spectrum = baseline["spectrum"].values
-    with np.errstate(divide="ignore", invalid="ignore"):
-        flat = power / spectrum
-        cross = cross / np.sqrt(spectrum[left] * spectrum[right])
-        weight = np.minimum(shape[..., left, :, :], shape[..., right, :, :])
+    flat = power / spectrum
+    cross = cross / np.sqrt(spectrum[left] * spectrum[right])
+    weight = np.minimum(shape[..., left, :, :], shape[..., right, :, :])
     left_power, right_power = flat[..., left, :, :], flat[..., right, :, :]
     present = np.isfinite(cross) & np.isfinite(left_power) & np.isfinite(right_power) & (weight > 0)
     weight = np.where(present, weight, 0.0)
@@ -233,11 +233,10 @@ def _pair_coherency(
         return np.concatenate([sums, sums.sum(axis=-1, keepdims=True)], axis=-1)
 
     product = summed(left_power).real * summed(right_power).real
-    with np.errstate(divide="ignore", invalid="ignore"):
-        sums = summed(cross) / np.sqrt(product)
-        count = np.fmin(
-            summed(np.ones_like(left_power)).real, product / summed(left_power * right_power).real
-        )
+    sums = summed(cross) / np.sqrt(product)
+    count = np.fmin(
+        summed(np.ones_like(left_power)).real, product / summed(left_power * right_power).real
+    )
     return np.where(count >= _MIN_FREQUENCIES, sums, complex(np.nan, np.nan)), count
 
 

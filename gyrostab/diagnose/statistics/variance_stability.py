@@ -182,6 +182,7 @@ def _band_groups(bands: int) -> list[NDArray[np.int64]]:
     ]
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def _relative_levels(
     blocks: xr.Dataset,
     baseline: xr.Dataset,
@@ -197,36 +198,34 @@ def _relative_levels(
     shape = blocks["shape"].values[..., used]
     if "shape_factor" in baseline:
         shape = shape * baseline["shape_factor"].values[used]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = (power / spectrum)[..., used]
-        present = np.isfinite(ratio).reshape(-1, *shape.shape).all(axis=0) & (shape > 0)
-        used_shape = np.where(present, shape, 0.0)
-        ratio = ratio * _limit_noisy_blocks(np.where(present, ratio, 0.0), used_shape)
-        weighted = np.where(present, ratio * used_shape, 0.0)
-        total, weight = (
-            np.stack([values[..., group].sum(axis=-1) for group in members], axis=-1)
-            for values in (weighted, used_shape)
-        )
-        level = total / weight
-        level = level / _robust_mean(level, weight)
+    ratio = (power / spectrum)[..., used]
+    present = np.isfinite(ratio).reshape(-1, *shape.shape).all(axis=0) & (shape > 0)
+    used_shape = np.where(present, shape, 0.0)
+    ratio = ratio * _limit_noisy_blocks(np.where(present, ratio, 0.0), used_shape)
+    weighted = np.where(present, ratio * used_shape, 0.0)
+    total, weight = (
+        np.stack([values[..., group].sum(axis=-1) for group in members], axis=-1)
+        for values in (weighted, used_shape)
+    )
+    level = total / weight
+    level = level / _robust_mean(level, weight)
     axes = [str(axis) for axis in blocks["axis"].values]
     level = np.nan_to_num(level)
     if len(axes) == 1:
         return [(level, weight)], axes
     joint_weight = weight.sum(axis=-3, keepdims=True)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        mean = np.nan_to_num((level * weight).sum(axis=-3, keepdims=True) / joint_weight)
+    mean = np.nan_to_num((level * weight).sum(axis=-3, keepdims=True) / joint_weight)
     joint_weight = joint_weight / _coherence_factor(blocks, used, members, weight)
     return [(level, weight), (mean, joint_weight)], [*axes, " ".join(axes)]
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def _limit_noisy_blocks(ratio: Array, shape: Array) -> Array:
     """Return the factor (record), axis, block, 1 that limits a noisy block, equal in all bands."""
     weight = shape.sum(axis=-1, keepdims=True)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        level = (ratio * shape).sum(axis=-1, keepdims=True) / weight
-        limit = _robust_mean(level, weight) * (1.0 + _MAX_AVERAGE_SIGMA / np.sqrt(weight))
-        return np.asarray(np.nan_to_num(np.minimum(limit / level, 1.0), nan=1.0))
+    level = (ratio * shape).sum(axis=-1, keepdims=True) / weight
+    limit = _robust_mean(level, weight) * (1.0 + _MAX_AVERAGE_SIGMA / np.sqrt(weight))
+    return np.asarray(np.nan_to_num(np.minimum(limit / level, 1.0), nan=1.0))
 
 
 def _coherence_factor(
@@ -247,17 +246,17 @@ def _coherence_factor(
     return np.asarray(1.0 + np.nan_to_num(pairs / share.sum(axis=-2)))[..., None, None, :]
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def _robust_mean(level: Array, weight: Array) -> Array:
     """Return the mean of each series of levels, from its median, robust against noisy blocks."""
     present = weight > 0
     usual = np.where(present, weight, 0.0).sum(axis=-2, keepdims=True) / np.maximum(
         present.sum(axis=-2, keepdims=True), 1
     )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(
-            _median_over_blocks(np.where(present, level, np.nan))
-            / (1.0 - 1.0 / (9.0 * np.maximum(usual, 0.5))) ** 3
-        )
+    return np.asarray(
+        _median_over_blocks(np.where(present, level, np.nan))
+        / (1.0 - 1.0 / (9.0 * np.maximum(usual, 0.5))) ** 3
+    )
 
 
 def _median_over_blocks(values: Array) -> Array:
@@ -271,6 +270,7 @@ def _median_over_blocks(values: Array) -> Array:
     return np.asarray((low + high) / 2.0)
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def _score_scatter(
     level: Array, weight: Array, windows: Windows, span: int, *, single: int
 ) -> tuple[Array, Array, Array]:
@@ -284,12 +284,11 @@ def _score_scatter(
         for values in (level, weight)
     )
     total = shape.sum(axis=-2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        average = (level * shape).sum(axis=-2) / total
-        middle = _robust_mean(average, total)
-        average = np.clip(average, None, middle * (1.0 + _MAX_AVERAGE_SIGMA / np.sqrt(total)))
-        present = total > 0
-        inverse = np.where(present, 1.0 / total, 0.0)
+    average = (level * shape).sum(axis=-2) / total
+    middle = _robust_mean(average, total)
+    average = np.clip(average, None, middle * (1.0 + _MAX_AVERAGE_SIGMA / np.sqrt(total)))
+    present = total > 0
+    inverse = np.where(present, 1.0 / total, 0.0)
     average = np.where(present, average, 0.0)
     # An incomplete average at the end of the record does not count.
     begin = np.minimum(-(-windows.first // span), count)
@@ -298,8 +297,7 @@ def _score_scatter(
     square = sum_over_windows(total * average**2, inside)
     number = sum_over_windows(present.astype(float), inside)
     weights = sum_over_windows(total, inside)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scatter = (square - first**2 / weights) / (first / weights) ** 2
+    scatter = (square - first**2 / weights) / (first / weights) ** 2
     mean, variance = scatter_moments(number, weights, sum_over_windows(inverse, inside))
     enough = (number >= _MIN_AVERAGES) & (weights > 0)
     single_sums = [
@@ -311,8 +309,7 @@ def _score_scatter(
         for pair in zip((scatter, mean, variance, weights), single_sums, strict=True)
     )
     enough = np.concatenate([enough, enough[..., :single].any(axis=-1, keepdims=True)], axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(enough, scatter / mean, np.nan)
-        variation = np.sqrt(np.maximum(scatter - mean, 0.0) / weights)
-        z = np.where(enough, cube_root_score(ratio, mean**2 / variance), np.nan)
-        return z, ratio, variation
+    ratio = np.where(enough, scatter / mean, np.nan)
+    variation = np.sqrt(np.maximum(scatter - mean, 0.0) / weights)
+    z = np.where(enough, cube_root_score(ratio, mean**2 / variance), np.nan)
+    return z, ratio, variation
