@@ -70,7 +70,9 @@ def power_factors(
         widest_limits,
     )
     return linear_model_factors(
-        with_independent_cells(model, baseline["common"].sel(axis=axis).values),
+        with_independent_cells(
+            model, baseline["common"].sel(axis=axis).values, np.ones_like(model.weight)
+        ),
         fold_blocks(data) if folds is None else folds,
     )
 

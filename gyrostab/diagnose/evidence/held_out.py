@@ -209,9 +209,7 @@ class LinearModel(NamedTuple):
         return np.where(usable, self.weight, 0.0)
 
 
-def with_independent_cells(
-    model: LinearModel, common: Array, unit: Array | None = None
-) -> LinearModel:
+def with_independent_cells(model: LinearModel, common: Array, unit: Array) -> LinearModel:
     """Transform a model whose cells vary together to independent cells; `remove_common_part`."""
     weight = model.usable_weight()
     present = weight[..., None] > 0.0

@@ -180,9 +180,7 @@ def power_products(residual: Array, weight: Array, columns: Array) -> Products:
     )
 
 
-def remove_common_part(
-    values: Array, weight: Array, common: Array, unit: Array | None = None
-) -> Array:
+def remove_common_part(values: Array, weight: Array, common: Array, unit: Array) -> Array:
     """Subtract the common part of the cells of each block, so that they become independent.
 
     Under random gaps the powers of all bands of a block vary together: their covariance is ``1 /
@@ -191,24 +189,23 @@ def remove_common_part(
 
     The values (block, cell, column) are data or designs. The weight (block, cell) is one over the
     variance that is not common, 0 for no data; `common` (block,) is the variance of the common
-    part, and `unit` (block, cell) its size in each cell, 1 by default.
+    part, and `unit` (block, cell) its size in each cell.
 
     Examples
     --------
     >>> weight, values = np.array([[4.0, 1.0]]), np.array([[[1.0], [3.0]]])
-    >>> free = remove_common_part(values, weight, np.array([0.5]))
+    >>> free = remove_common_part(values, weight, np.array([0.5]), np.ones((1, 2)))
     >>> float((weight[..., None] * free**2).sum().round(9))
     6.0
     >>> float((values[0].T @ np.linalg.inv([[0.75, 0.5], [0.5, 1.5]]) @ values[0])[0, 0].round(9))
     6.0
     """
-    cell_unit = np.ones_like(weight) if unit is None else unit
-    total = (weight * cell_unit**2).sum(axis=1)
+    total = (weight * unit**2).sum(axis=1)
     factor = np.where(total > 0.0, 1.0 - 1.0 / np.sqrt(1.0 + common * total), 0.0) / np.where(
         total > 0.0, total, 1.0
     )
-    common_part = np.einsum("bc,bck->bk", weight * cell_unit, values) * factor[:, None]
-    return np.asarray(values - cell_unit[..., None] * common_part[:, None])
+    common_part = np.einsum("bc,bck->bk", weight * unit, values) * factor[:, None]
+    return np.asarray(values - unit[..., None] * common_part[:, None])
 
 
 def log_evidence(

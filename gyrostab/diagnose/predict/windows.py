@@ -362,14 +362,14 @@ def max_correlation(surrogate: Variant, true: Variant, row: int) -> float:
     return float(np.max(np.abs((a * b).sum(axis=1)) / np.where(size > 0, size, 1.0)))
 
 
-def hat_functions(begin: Array, end: Array, knots: int = _SPLINE_KNOTS) -> Array:
+def hat_functions(begin: Array, end: Array) -> Array:
     """Return piecewise linear hat functions over the record, (knot, block).
 
     Examples
     --------
-    >>> hat_functions(np.arange(4.0), np.arange(1.0, 5.0), 2).sum(axis=0)
+    >>> hat_functions(np.arange(4.0), np.arange(1.0, 5.0)).sum(axis=0)
     array([1., 1., 1., 1.])
     """
     middle = (begin + end) / 2.0
-    places = np.linspace(begin[0], end[-1], knots)
-    return np.stack([np.interp(middle, places, row) for row in np.eye(knots)])
+    places = np.linspace(begin[0], end[-1], _SPLINE_KNOTS)
+    return np.stack([np.interp(middle, places, row) for row in np.eye(_SPLINE_KNOTS)])
