@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gyrostab.schema import find_unusable_channels, log_channels, signal_name
 from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_index, grid_times
@@ -55,7 +55,7 @@ class Aligned(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Clock:
+class Clock:
     """Time stamps of a channel [ns since 1970]: a uniform grid, or an array."""
 
     size: int
@@ -69,13 +69,12 @@ class _Clock:
             return self.stamps[low:high]
         return grid_times(self.start, self.rate, np.arange(low, high))
 
-    def count_before(self, instant: int) -> int:
-        """Count the values before an instant."""
+    def count_before(self, instants: ArrayLike) -> Stamps:
+        """Count the values before each instant [ns since 1970]."""
         if self.stamps is not None:
-            return int(np.searchsorted(self.stamps, instant))
-        return int(
-            np.clip(np.ceil(float(grid_index(self.start, self.rate, instant))), 0, self.size)
-        )
+            return np.asarray(np.searchsorted(self.stamps, instants))
+        places = np.ceil(grid_index(self.start, self.rate, instants))
+        return np.clip(places, 0, self.size).astype(np.int64)
 
     def find_period(self) -> float:
         """Return the median interval [ns], or the mean without gaps where intervals are uneven.
@@ -139,7 +138,7 @@ def align_channels(log: xr.Dataset) -> Aligned:
 
 def _place_channel(log: xr.Dataset, name: str) -> tuple[Any, str] | str | None:
     """Resample a channel, with a note; or say why it is not used; None if it keeps its stamps."""
-    clock = _clock_of(log, name)
+    clock = read_clock(log, name)
     rate, start, size = float(log.attrs["sampling_rate_hz"]), first_stamp(log), log.sizes["time"]
     if not clock.size:
         return "it holds no value"
@@ -190,19 +189,20 @@ def _is_wave_of_rotation(log: xr.Dataset, name: str) -> bool:
     )
 
 
-def _clock_of(log: xr.Dataset, name: str) -> _Clock:
+def read_clock(log: xr.Dataset, name: str) -> Clock:
+    """Return the time stamps of a channel that has its own."""
     index = log.xindexes.get(f"time_{name}")
     if isinstance(index, TimeGridIndex):
-        return _Clock(log.sizes[f"time_{name}"], index.start, index.rate)
+        return Clock(log.sizes[f"time_{name}"], index.start, index.rate)
     stamps = to_nanoseconds(log[f"time_{name}"].values)
-    return _Clock(stamps.size, stamps=stamps)
+    return Clock(stamps.size, stamps=stamps)
 
 
 def _describe_placement(
-    name: str, clock: _Clock, start: int, rate: float, period: float, method: str
+    name: str, clock: Clock, start: int, rate: float, period: float, method: str
 ) -> str:
     """Describe the offset of the stamps from those of the gyro; empty if there is none."""
-    place = min(clock.count_before(start), clock.size - 1)
+    place = min(int(clock.count_before(start)), clock.size - 1)
     skew = float(grid_index(start, rate, clock.stamps_between(place, place + 1))[0])
     skew = (skew - round(skew)) / rate
     if abs(skew) < 1e-3 / rate and abs(period * rate / 1e9 - 1.0) < 1e-3:
@@ -219,7 +219,7 @@ def _describe_placement(
 # -------------------------------------------------------------------------------- chunk by chunk
 
 
-def _place_on_grid(log: xr.Dataset, name: str, clock: _Clock, reach: float, choose: _Choose) -> Any:
+def _place_on_grid(log: xr.Dataset, name: str, clock: Clock, reach: float, choose: _Choose) -> Any:
     """Return the samples of a channel on the gyro's grid; lazy, in its chunks, if the log is.
 
     NaN where no value is within reach [ns].
@@ -242,8 +242,8 @@ def _place_on_grid(log: xr.Dataset, name: str, clock: _Clock, reach: float, choo
     pieces = []
     for low, high in pairwise(edges):  # the values that the samples need, and one on either side
         first, last = (int(edge) for edge in grid_times(start, rate, [low, high - 1]))
-        begin = max(clock.count_before(first - int(reach)) - 1, 0)
-        end = min(clock.count_before(last + int(reach)) + 1, clock.size)
+        begin = max(int(clock.count_before(first - int(reach))) - 1, 0)
+        end = min(int(clock.count_before(last + int(reach))) + 1, clock.size)
         pieces.append((data[begin:end], begin, low, high))
     if isinstance(signal, np.ndarray) and isinstance(data, np.ndarray):
         return np.concatenate([place_values(*piece) for piece in pieces])

@@ -9,11 +9,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.diagnose.reduce.aligned_channels import interpolate_linearly
+from gyrostab.diagnose.reduce.aligned_channels import interpolate_linearly, read_clock
 from gyrostab.schema import find_unusable_channels, log_channels, signal_name
 from gyrostab.simulate.drivers import make_source
 from gyrostab.store import lazy
-from gyrostab.time.grid import TimeGridIndex, grid_index
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import HOUR
 
@@ -117,12 +116,7 @@ def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: 
     The ends of the intervals rise [ns since 1970]. The mean, or the root mean square, is NaN where
     the channel has no value for longer than three of its median intervals.
     """
-    data, index = log[name].data, log.xindexes.get(f"time_{name}")
-    if isinstance(index, TimeGridIndex):
-        places = np.ceil(grid_index(index.start, index.rate, edges))
-        ends = np.clip(places, 0, data.size).astype(np.int64)
-    else:
-        ends = np.searchsorted(to_nanoseconds(log[f"time_{name}"].values), edges)
+    data, ends = log[name].data, read_clock(log, name).count_before(edges)
     sums, counts = np.zeros(edges.size - 1), np.zeros(edges.size - 1)
     low = 0
     while low < edges.size - 1:
