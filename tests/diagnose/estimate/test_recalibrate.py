@@ -374,9 +374,9 @@ def test_anomalous_samples_do_not_raise_the_noise(size):
     )
     baseline = calibrate_noise(blocks)
     identifications = identify_by_hand(blocks, baseline, "spikes", "sample_counts", ("outliers",))
-    identifications = replace(
-        identifications, count_evidence=CountEvidence({"outliers": (np.zeros(1), np.ones(1))})
-    )
+    counted = CountEvidence({"outliers": (np.zeros(1), np.ones(1))})
+    examination = replace(identifications.examination, count_evidence=counted)
+    identifications = replace(identifications, examination=examination)
     (fitted,) = fit_identifications(identifications, baseline)
     for name, true in (("per_hour", 60.0), ("size", size)):
         estimate = fitted.parameters[name]
