@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from numpy.testing import assert_allclose
+from scipy.signal import lfilter
 
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
 from gyrostab.diagnose.evidence.mixture import Mixture
@@ -33,6 +34,7 @@ from gyrostab.diagnose.result.rejections import find_rejections
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.ingest.make_log import make_log
+from gyrostab.kernels.thermal import apply_dead_band
 from tests.support.candidates import select_candidate
 from tests.support.named import WORLD, name_effects, nulls, record
 
@@ -368,3 +370,19 @@ def test_sizes_of_infinite_error_may_have_any_value() -> None:
     assert distance_to_range(sizes, unknown, -limit, limit) == 0.0
     half_known = np.diag([np.inf, 1.0])
     assert distance_to_range(sizes, half_known, -limit, limit) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", ["temperature_bias", "thermal_hysteresis"])
+def test_a_lag_of_the_temperature_sensor_is_no_other_effect(effect):
+    """The sensor of a tool that heats and cools at 2 degC/min lags by 20 s."""
+    rate, lag = 5.0, 20.0
+    t = np.arange(18_000) / rate
+    true = 30.0 + np.interp(t, [0, 600, 900, 1500, 2100, 2700, 3600], [0, 20, 20, 5, 5, 25, 10])
+    sensor = lfilter([1.0 / (lag * rate)], [1.0, 1.0 / (lag * rate) - 1.0], true - 30.0) + 30.0
+    cause = true - apply_dead_band(true, 1.5, true[0])[0] if effect != "temperature_bias" else true
+    rates = np.random.default_rng(1).standard_normal((1, t.size)) + 0.4 * cause
+    log = make_log(rates, rate=rate, unit="deg/h", channels={"temperature": (sensor, "degC")})
+    blocks = reduce_log(log)
+    identified = name_effects(blocks, *nulls(blocks, 20)).identified
+    assert [identification.effect for identification in identified] == [effect]

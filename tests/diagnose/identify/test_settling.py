@@ -13,12 +13,17 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify import selection as selecting
 from gyrostab.diagnose.identify.examination import Examination, nuisance_alternatives
-from gyrostab.diagnose.identify.identification import make_selection
+from gyrostab.diagnose.identify.identification import (
+    Selection,
+    ambiguous_evidence,
+    make_selection,
+)
 from gyrostab.diagnose.identify.settling import prune_selections, settle_selections
 from gyrostab.diagnose.identify.withdrawal import _without_part_of_drift, withdraw_effects
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.ingest.make_log import make_log
@@ -180,3 +185,49 @@ def test_what_fails_the_time_shift_test_is_barred_before_random_biases_are_tried
     assert not chosen
     assert list(beaten) == ["shupe"]
     assert tried == [(set(), False), ({"shupe"}, False), ({"shupe"}, True)]
+
+
+@pytest.mark.parametrize(("statistic", "least"), [("mean", 1977.0), ("random_process", 1997.0)])
+def test_alternatives_may_lack_what_an_error_of_the_form_costs(statistic, least):
+    """3 nats, and 1 % of the evidence; a random walk has no form that may be wrong."""
+    variant = Variant({}, ("size",), np.ones((1, 1, BLOCKS)))
+    candidate = Candidate("shupe", find_statistic(statistic), ("temperature",), (variant,))
+    component = Component(candidate, variant, ("x",), 2000.0)
+    assert ambiguous_evidence([component], 2000.0) == pytest.approx(least)
+
+
+def test_alternatives_of_a_strong_effect_are_listed_within_the_error_of_its_form():
+    """A supply voltage with the course of the temperature and 1.5 % noise explains little less."""
+    rng = np.random.default_rng(1)
+    course = np.repeat(np.cumsum(rng.standard_normal(BLOCKS)), 20)
+    other = course + 0.015 * course.std() * np.repeat(rng.standard_normal(BLOCKS), 20)
+    values = 0.18 * rng.standard_normal(BLOCKS * 20) + 3.0 * course / course.std()
+    channels = {"temperature": (30.0 + course, "degC"), "supply_voltage": (28.0 + other, "V")}
+    examination = _examine(values, 1.0, channels, ("temperature_bias", "supply_bias"))
+    chosen, _ = selecting._select_all(examination)
+    (settled,) = settle_selections(examination, prune_selections(examination, chosen))[1]
+    rival = max(nats for key, nats in settled.instead.items() if "supply" in key)
+    assert 3.0 < settled.evidence_nats - rival < 3.0 + 0.01 * settled.evidence_nats
+    assert settled.alternatives == ("supply_bias",)
+
+
+def test_spikes_of_a_comb_of_lines_are_not_identified(monkeypatch):
+    def selection(effect, statistic, place):
+        candidate = Candidate(effect, find_statistic(statistic), (), ())
+        component = Component(candidate, None, ("x",), 50.0, place)
+        return Selection(effect, (), ("x",), (component,), 50.0, 8.0)
+
+    lines = [selection("spectral_line", "spectral_line", place) for place in (10, 20, 30)]
+    found = [selection("spikes", "sample_counts", -1), *lines]
+    examination = SimpleNamespace(
+        settings=DEFAULTS, candidates=(), expected=(), state_with=lambda selections: None
+    )
+    for name, result in (
+        ("identify_expected_effects", lambda given: given),
+        ("_select_all", lambda given: (found, {})),
+        ("prune_selections", lambda given, chosen: chosen),
+        ("settle_selections", lambda given, chosen: (chosen, chosen)),
+        ("withdraw_effects", lambda given, identified, unidentified: (identified, [])),
+    ):
+        monkeypatch.setattr(selecting, name, result)
+    assert selecting.identify_effects(examination).identified == tuple(lines)
