@@ -13,14 +13,16 @@ from gyrostab.diagnose.statistics.cross_spectrum import CrossSpectrum
 from gyrostab.diagnose.statistics.drifting_line import DriftingLine
 from gyrostab.diagnose.statistics.mean import Mean
 from gyrostab.diagnose.statistics.power import Power
-from gyrostab.diagnose.statistics.random_process import RandomProcess, WanderingBias
+from gyrostab.diagnose.statistics.ramp_phase import RampPhase
+from gyrostab.diagnose.statistics.random_process import RandomProcess
 from gyrostab.diagnose.statistics.restart import Restart
-from gyrostab.diagnose.statistics.rotation_order import RampPhase, RotationOrder
+from gyrostab.diagnose.statistics.rotation_order import RotationOrder
 from gyrostab.diagnose.statistics.sample_counts import SampleCounts
 from gyrostab.diagnose.statistics.spectral_line import SpectralLine
 from gyrostab.diagnose.statistics.telegraph import Telegraph
 from gyrostab.diagnose.statistics.transfer import Transfer
 from gyrostab.diagnose.statistics.variance_stability import VarianceStability
+from gyrostab.diagnose.statistics.wandering_bias import WanderingBias
 
 __all__ = ["STATISTICS", "Statistic", "find_statistic"]
 
