@@ -439,7 +439,7 @@ def _log_evidence(
     variance: float,
     log_weight: Array,
 ) -> tuple[float, float]:
-    """Return the log evidence of columns, those after `own` with a prior variance; and the step."""
+    """Return the log evidence of columns, with a prior beyond `base_count`; and the step."""
     part = products._replace(
         cross=products.cross[:, chosen], gram=products.gram[:, chosen[:, None], chosen]
     )
