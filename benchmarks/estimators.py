@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 from fit_coverage import choose_squares, make_units, surface_of
-from numpy.typing import NDArray
 from page import make_parser, renew, table
 from scipy.fft import dct
 from scipy.optimize import least_squares, nnls
@@ -24,10 +23,10 @@ from scipy.stats import chi2
 
 from gyrostab import davar, fit_noise, make_log
 from gyrostab.allan import window_fit
+from gyrostab.arrays import Floats, Ints
 from gyrostab.kernels.spectra.expected import sample_covariance
 from gyrostab.noise import LAWS, NORMAL_95, TERMS, avar_columns
 
-Array = NDArray[np.float64]
 MIXTURES = ("", "Qs", "Bm", "Bs", "Km", "Ks", "Rs", "QsBsKsRs")
 #: Length [s], rate [Hz] and number of records.
 LENGTHS = ((40.0, 100.0, 200), (600.0, 100.0, 100), (7200.0, 10.0, 100))
@@ -38,37 +37,37 @@ SINGLE, GROUPS = 64, 200
 class Records(NamedTuple):
     """Records of one length and mixture (n_records, n), with their Allan variances."""
 
-    values: Array
+    values: Floats
     rate: float
     surface: xr.Dataset  # with the averaging times that `davar` chooses
     #: At up to 100 averaging times up to a tenth of the record, and at 1, 2, 4, ... samples up to a
     #: quarter of it: averaging factors, and Allan variance (n_records, n_factors).
-    dense: tuple[NDArray[np.int64], Array]
-    octaves: tuple[NDArray[np.int64], Array]
+    dense: tuple[Ints, Floats]
+    octaves: tuple[Ints, Floats]
     #: At a quarter of it: averaging factors (1,), and Allan variance (n_records, 1).
-    quarter: tuple[NDArray[np.int64], Array]
+    quarter: tuple[Ints, Floats]
 
 
 class Estimates(NamedTuple):
     """Coefficients with the ends of their 95 % intervals, (n_records, 5)."""
 
-    value: Array
-    low: Array
-    high: Array
+    value: Floats
+    low: Floats
+    high: Floats
 
 
-def from_squares(square: Array, error: Array) -> Estimates:
+def from_squares(square: Floats, error: Floats) -> Estimates:
     """Take the roots of squared coefficients and of their normal intervals."""
     ends = (square, square - NORMAL_95 * error, square + NORMAL_95 * error)
     return Estimates(*(np.sqrt(np.maximum(end, 0.0)) for end in ends))
 
 
-def without_intervals(value: Array) -> Estimates:
+def without_intervals(value: Floats) -> Estimates:
     nothing = np.full(value.shape, np.nan)
     return Estimates(value, nothing, nothing)
 
 
-def measure_avar(values: Array, rate: float, ks: NDArray[np.int64]) -> Array:
+def measure_avar(values: Floats, rate: float, ks: Ints) -> Floats:
     n = values.shape[1]
     log = make_log(values.reshape(-1), rate=rate, unit="deg/h")
     taus = list(ks / rate)
@@ -76,7 +75,7 @@ def measure_avar(values: Array, rate: float, ks: NDArray[np.int64]) -> Array:
     return np.asarray(surface.avar.values[0])
 
 
-def make_records(values: Array, rate: float) -> Records:
+def make_records(values: Floats, rate: float) -> Records:
     n = values.shape[1]
     dense = np.unique(np.round(np.geomspace(1, n // 10, 100)).astype(np.int64))
     octaves = 2 ** np.arange(int(np.log2(n)) - 1)
@@ -116,10 +115,10 @@ class Cosines:
         self.columns = self.average(columns)
         self.ramp = dct((lag - (n - 1) / 2) / rate / 3600, norm="ortho")[1 : SINGLE + 1]
 
-    def average(self, values: Array) -> Array:
+    def average(self, values: Floats) -> Floats:
         return np.asarray((np.add.reduceat(values, self.edges, axis=0).T / self.count).T)
 
-    def information(self, squares: Array, *, free_ramp: bool) -> tuple[Array, float]:
+    def information(self, squares: Floats, *, free_ramp: bool) -> tuple[Floats, float]:
         """Compute the Fisher information of the four squares (4, 4) and of the ramp."""
         expected = self.columns @ squares[:4]
         share = self.columns / expected[:, None]
@@ -132,7 +131,7 @@ class Cosines:
             total += 0.5 * np.outer(mixed, mixed) / ramp**2
         return total, ramp
 
-    def bounds(self, squares: Array) -> Array:
+    def bounds(self, squares: Floats) -> Floats:
         """Compute the Cramer-Rao bounds of the standard errors (5,) with the terms known."""
         information, ramp = self.information(squares, free_ramp=squares[4] > 0)
         present = np.flatnonzero(squares[:4])
@@ -142,7 +141,7 @@ class Cosines:
         out[4] = 1.0 / np.sqrt(ramp)
         return out
 
-    def maximise(self, cosines: Array) -> tuple[Array, Array]:
+    def maximise(self, cosines: Floats) -> tuple[Floats, Floats]:
         """Return squares and slope of largest (restricted) likelihood, and their errors, (5,)."""
         power, low = self.average(cosines**2), cosines[:SINGLE]
         squares = np.array([0.0, np.median(power / self.columns[:, 1]), 0.0, 0.0])
@@ -272,7 +271,7 @@ ESTIMATORS: dict[str, Callable[[Records], Estimates]] = {
 }
 
 
-def judge(estimates: Estimates, true: Array, bound: Array) -> Array:
+def judge(estimates: Estimates, true: Floats, bound: Floats) -> Floats:
     """Return relative bias and RMSE, efficiency and coverage of each term, (4, 5)."""
     value, low, high = estimates
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -304,12 +303,12 @@ def compare(seconds: float, rate: float, trials: int, mixtures: tuple[str, ...] 
             yield mixture or "none", TERMS[a], bound[a] / true[a], own, times
 
 
-def _default_factors(record: Array, rate: float) -> tuple[int, ...]:
+def _default_factors(record: Floats, rate: float) -> tuple[int, ...]:
     ks = np.round(surface_of(record, rate).tau.values * rate).astype(np.int64)
     return tuple(ks.tolist())
 
 
-def summarise(cells: dict[str, list[tuple[str, Array]]], times: dict[str, list[float]]) -> str:
+def summarise(cells: dict[str, list[tuple[str, Floats]]], times: dict[str, list[float]]) -> str:
     """Tabulate median efficiency, largest bias and mean coverage of each term and estimator."""
     rows = []
     for name, figures in cells.items():
@@ -323,7 +322,7 @@ def summarise(cells: dict[str, list[tuple[str, Array]]], times: dict[str, list[f
     return table(["estimator", *TERMS, "time of a record"], rows)
 
 
-def describe(figures: Array) -> str:
+def describe(figures: Floats) -> str:
     bias, error, efficiency, holds = figures
     text = f"{bias:+.1%}; {error:.1%}; {efficiency:.2f}"
     return text if np.isnan(holds) else f"{text}; {holds:.2f}"
@@ -331,7 +330,7 @@ def describe(figures: Array) -> str:
 
 def main() -> None:
     output = make_parser(__doc__).parse_args().output
-    cells: dict[str, list[tuple[str, Array]]] = {name: [] for name in ESTIMATORS}
+    cells: dict[str, list[tuple[str, Floats]]] = {name: [] for name in ESTIMATORS}
     times: dict[str, list[float]] = {name: [] for name in ESTIMATORS}
     rows = []
     for seconds, rate, trials in LENGTHS:

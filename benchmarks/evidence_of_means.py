@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from page import make_parser, table
 
+from gyrostab.arrays import Floats
 from gyrostab.blindtest.generator.detection_limits import NATS, learned_nats
 from gyrostab.diagnose.baseline.calibrate import grid_values
 from gyrostab.diagnose.baseline.posterior import visible_coefficients
@@ -28,7 +28,6 @@ from gyrostab.diagnose.predict.search import collect_evidence, combine_rows
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
 BLOCKS, BLOCK_S, RATE = 90, 20.0, 10.0
 N, B, K = 0.003, 0.004, 0.02
 AXES = 3
@@ -82,13 +81,13 @@ def make_baseline() -> xr.Dataset:
     )
 
 
-def draw_noise(rng: np.random.Generator, records: int) -> Array:
+def draw_noise(rng: np.random.Generator, records: int) -> Floats:
     """Draw block means (record, block) [degree hour-1]."""
     white, steps = rng.standard_normal((2, records, BLOCKS))
     return np.asarray(np.sqrt(WHITE) * white + np.sqrt(STEP) * steps.cumsum(axis=1))
 
 
-def compute_evidence(axes: list[Array], baseline: xr.Dataset) -> tuple[Array, Array]:
+def compute_evidence(axes: list[Floats], baseline: xr.Dataset) -> tuple[Floats, Floats]:
     """Return the evidence (candidate, record) of each axis alone on intervals, and as it is now."""
     coordinates = {"begin": ("block", EDGES[:-1]), "end": ("block", EDGES[1:]), "axis": ["x"]}
     factors = [
@@ -111,14 +110,14 @@ def compute_evidence(axes: list[Array], baseline: xr.Dataset) -> tuple[Array, Ar
     )
 
 
-def intervals_alone(factors: Array) -> Array:
+def intervals_alone(factors: Floats) -> Floats:
     """Return the evidence on held-out intervals, all variants equally probable."""
     mixed = np.logaddexp.reduce(factors, axis=1) - np.log(factors.shape[1])
     parts = (mixed[:1] - mixed[1:]).reshape(-1, FOLDS, mixed.shape[1]).sum(axis=1)
     return np.asarray(parts.max(axis=0))
 
 
-def size_at(shape: Array, strength: float) -> float:
+def size_at(shape: Floats, strength: float) -> float:
     """Return the size of a shape at a strength in units of the limit, with all noise known."""
     place = np.arange(1, BLOCKS + 1)
     precision = np.linalg.inv(np.eye(BLOCKS) * WHITE + np.minimum.outer(place, place) * STEP)
@@ -127,7 +126,7 @@ def size_at(shape: Array, strength: float) -> float:
     return float(strength * np.sqrt(2.0 * NATS / square))
 
 
-def expected_nats(mean: Array) -> float:
+def expected_nats(mean: Floats) -> float:
     """Return `learned_nats` of a mean on one axis."""
     samples = np.repeat(mean, round(BLOCK_S * RATE))
     scenario: Any = SimpleNamespace(

@@ -25,15 +25,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from page import in_new_process, machine, make_parser, memory, renew, table
 from scaling import AXES, COUNT, RATE, WINDOW, run_log, write_store
+
+from gyrostab.arrays import Floats, Ints
 
 START_NS = 1_777_593_600_000_000_000  # 2026-05-01
 BLOCK_ROWS = 2**19
 AXIS_NAMES = "xyz"[:AXES]
 MAP = [f"gyro_{axis}" for axis in AXIS_NAMES]
-Block = tuple[int, NDArray[np.int64], NDArray[np.float64]]
+Block = tuple[int, Ints, Floats]
 
 
 def blocks(hours: float) -> Iterator[Block]:

@@ -24,16 +24,16 @@ import netCDF4
 import numpy as np
 import xarray as xr
 from foreign import write_own
-from numpy.typing import NDArray
 from page import machine, make_parser, renew, table
 
 from gyrostab import to_netcdf
+from gyrostab.arrays import Floats
 from gyrostab.io.opening import open_log
 from gyrostab.kernels.encoding.counts import from_counts
 from gyrostab.store.lazy import read_into
 from gyrostab.store.private import library_lock
 
-Read = Callable[[int, int, int], NDArray[np.float64]]
+Read = Callable[[int, int, int], Floats]
 
 
 def readers_of(path: Path) -> tuple[dict[str, Read], list[tuple[int, int, int]]]:
@@ -44,17 +44,17 @@ def readers_of(path: Path) -> tuple[dict[str, Read], list[tuple[int, int, int]]]
     length, scale, fill = plain.chunking()[1], float(plain.scale_factor), int(plain._FillValue)
     plain.set_auto_maskandscale(False)
 
-    def decode(counts: Any) -> NDArray[np.float64]:
+    def decode(counts: Any) -> Floats:
         out = np.empty(counts.size)
         from_counts(counts, scale, fill, out=out)
         return out
 
-    def read_netcdf(row: int, begin: int, end: int) -> NDArray[np.float64]:
+    def read_netcdf(row: int, begin: int, end: int) -> Floats:
         with lock:
             counts = plain[row, begin:end]
         return decode(counts)
 
-    def read_directly(row: int, begin: int, end: int) -> NDArray[np.float64]:
+    def read_directly(row: int, begin: int, end: int) -> Floats:
         out = np.empty(end - begin)
         read_into(data, row, begin, out)
         return out

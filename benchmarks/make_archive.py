@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from page import make_parser
 
 import gyrostab
+from gyrostab.arrays import Bools, Floats
 from gyrostab.ingest.gap_table import gap_variables
 
 START = np.datetime64("2026-01-01", "ns")
@@ -78,9 +78,7 @@ def make_archive(
     return made
 
 
-def draw_counts(
-    number: int, size: int, rate: int, level: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def draw_counts(number: int, size: int, rate: int, level: Floats) -> tuple[Floats, Floats]:
     """Return the first `size` samples of a file (axis, time), and the level of the walk after them.
 
     They follow from the number of the file and the level before it, so two files agree where they
@@ -95,7 +93,7 @@ def draw_counts(
     return np.rint(noise + walk.repeat(rate, axis=0)[:size]).T, walk[-1]
 
 
-def draw_missing(number: int, size: int, rate: int, share: float) -> NDArray[np.bool_]:
+def draw_missing(number: int, size: int, rate: int, share: float) -> Bools:
     """Return which samples of a file are missing; the first gap extends to the end of the file."""
     rng, missing = np.random.default_rng([2, number]), np.zeros(size, bool)
     left, begin = round(share * size), size
@@ -107,7 +105,7 @@ def draw_missing(number: int, size: int, rate: int, share: float) -> NDArray[np.
     return missing
 
 
-def make_log(counts: NDArray[np.float64], axes: str, first: int, rate: int) -> xr.Dataset:
+def make_log(counts: Floats, axes: str, first: int, rate: int) -> xr.Dataset:
     """Return the file as a log in degree per hour, with a temperature every second."""
     present = np.flatnonzero(np.isfinite(counts[0]))
     begin, end = int(present[0]), int(present[-1]) + 1
@@ -126,13 +124,13 @@ def make_log(counts: NDArray[np.float64], axes: str, first: int, rate: int) -> x
     return log
 
 
-def temperature(seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+def temperature(seconds: Floats) -> Floats:
     """A tool that warms up and then follows its depth [degree Celsius]."""
     warm_up = 40.0 * (1.0 - np.exp(-seconds / 7200.0))
     return np.round(25.0 + warm_up + 10.0 * np.sin(seconds / 9000.0), 3)
 
 
-def write_csv(path: Path, counts: NDArray[np.float64], axes: str, first: int, rate: int) -> None:
+def write_csv(path: Path, counts: Floats, axes: str, first: int, rate: int) -> None:
     """Write one file as text: nanoseconds since 1970, counts, a temperature every second."""
     import pyarrow as pa
     from pyarrow import csv

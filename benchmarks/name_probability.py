@@ -18,16 +18,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from page import make_parser
 from scipy.optimize import minimize
 from scipy.special import expit
 
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.blindtest.scoring.probability import expected_calibration_error
 from gyrostab.blindtest.scoring.score import drawn_rows, score_case
 from gyrostab.diagnose.settings import DEFAULTS
 
-Array = NDArray[np.float64]
 PARTS = 10
 #: Standard deviation of the two log odds of the fit about zero, which bounds them.
 PRIOR_SD = 3.0
@@ -37,9 +36,9 @@ STEP = 1e-3
 class Names(NamedTuple):
     """Identified names."""
 
-    run: NDArray[np.int64]  # number of the folder
-    rivals: Array  # sum of exp(evidence of an alternative - evidence) over the alternatives
-    right: NDArray[np.bool_]
+    run: Ints  # number of the folder
+    rivals: Floats  # sum of exp(evidence of an alternative - evidence) over the alternatives
+    right: Bools
 
 
 def main() -> None:
@@ -69,7 +68,7 @@ def main() -> None:
     print(f"one probability for all names: log score {log_score(constant, names.right):.3f} nats")
 
 
-def print_score(label: str, stated: Array, right: NDArray[np.bool_]) -> None:
+def print_score(label: str, stated: Floats, right: Bools) -> None:
     """Print the log score and the calibration error of stated probabilities."""
     error = expected_calibration_error(stated, right.astype(float))
     score = log_score(stated, right)
@@ -107,23 +106,23 @@ def sum_rivals(name: str, diagnosis: dict[str, Any]) -> float:
     )
 
 
-def probabilities(law: Array, rivals: Array) -> Array:
+def probabilities(law: Floats, rivals: Floats) -> Floats:
     """Return the probability of each name; `law` has the log odds and the log of the weight."""
     return np.asarray(expit(law[0]) / (1.0 + np.exp(law[1]) * rivals))
 
 
-def fit_law(names: Names) -> Array:
+def fit_law(names: Names) -> Floats:
     """Fit the law by penalised maximum likelihood."""
     return np.asarray(minimize(penalised_loss, np.zeros(2), args=(names,)).x)
 
 
-def penalised_loss(law: Array, names: Names) -> float:
+def penalised_loss(law: Floats, names: Names) -> float:
     """Return the negative log-likelihood with the prior of the law [nats]."""
     loss = log_score(probabilities(law, names.rivals), names.right) * names.right.size
     return float(loss + 0.5 * (law**2).sum() / PRIOR_SD**2)
 
 
-def curvature(law: Array, names: Names) -> Array:
+def curvature(law: Floats, names: Names) -> Floats:
     """Return the second derivatives of the loss."""
     steps = STEP * np.eye(2)
     return np.array(
@@ -142,7 +141,7 @@ def curvature(law: Array, names: Names) -> Array:
     )
 
 
-def fit_without_own_run(names: Names) -> Array:
+def fit_without_own_run(names: Names) -> Floats:
     """Return the probability of each name by the law that is fitted to the other folders."""
     stated = np.empty(names.right.size)
     for run in np.unique(names.run):
@@ -152,14 +151,14 @@ def fit_without_own_run(names: Names) -> Array:
     return stated
 
 
-def cross_validate(names: Names) -> Array:
+def cross_validate(names: Names) -> Floats:
     """Return for each name the share of names in the other parts that is right."""
     part = np.random.default_rng(0).permutation(names.right.size) % PARTS
     share = [names.right[part != number].mean() for number in range(PARTS)]
     return np.clip(share, 1.0 / names.right.size, 1.0 - 1.0 / names.right.size)[part]
 
 
-def log_score(stated: Array, right: NDArray[np.bool_]) -> float:
+def log_score(stated: Floats, right: Bools) -> float:
     """Return the mean negative log-probability of what is true."""
     return float(-np.log(np.where(right, stated, 1.0 - stated)).mean())
 

@@ -15,16 +15,15 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from page import make_parser, renew, table
 
 from gyrostab.allan.davar import davar
 from gyrostab.allan.fit import fit_noise
+from gyrostab.arrays import Floats
 from gyrostab.ingest.make_log import make_log
 from gyrostab.noise import LAWS, model_avar
 from gyrostab.simulate import simulate
 
-Array = NDArray[np.float64]
 #: Noise of the west gyro at rest, L13, Table 1.
 _AT_REST = {"Q": 5.49020943, "N": 0.01657046, "B": 0.13814101, "K": 0.31584771, "R": 0.24861667}
 
@@ -45,15 +44,15 @@ def errata() -> list[Erratum]:
     return [show() for show in _SHOWN]
 
 
-def _white(size: int, *, mean: float = 0.0) -> Array:
+def _white(size: int, *, mean: float = 0.0) -> Floats:
     return mean + np.random.default_rng(1).standard_normal(size)
 
 
-def _averages(rate: Array, k: int) -> Array:
+def _averages(rate: Floats, k: int) -> Floats:
     return np.convolve(rate, np.full(k, 1.0 / k), mode="valid")
 
 
-def _estimate_avar(values: Array, k: int, *, kind: str = "rate", zero_fill: bool = False) -> float:
+def _estimate_avar(values: Floats, k: int, *, kind: str = "rate", zero_fill: bool = False) -> float:
     """Allan variance of samples at 100 Hz over all of the record, as one window.
 
     With `zero_fill`, the sum is divided by the number of terms without gaps.
@@ -64,7 +63,7 @@ def _estimate_avar(values: Array, k: int, *, kind: str = "rate", zero_fill: bool
     return float((surface["avar"] * (surface["coverage"] if zero_fill else 1.0)).values.item())
 
 
-def _filtered(density: Callable[[Array], Array], tau: float) -> float:
+def _filtered(density: Callable[[Floats], Floats], tau: float) -> float:
     """Integrate P16 Eq. 7 with df, 4 int S(f) sin^4(pi f tau) / (pi f tau)^2 df.
 
     The variable is pi f tau on a geometric grid.

@@ -29,8 +29,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.units import HOUR
 
 #: One microradian per second in degree per hour.
@@ -81,7 +81,7 @@ class NoiseLaw:
         """Allan variance of a unit coefficient at one second [degree2 hour-2]."""
         return self.seconds_factor * self.avar_factor
 
-    def avar(self, tau: Any, coefficient: float = 1.0) -> NDArray[np.float64]:
+    def avar(self, tau: Any, coefficient: float = 1.0) -> Floats:
         """Allan variance of the term [degree2 hour-2] at `tau` [s] for `coefficient` [`label`]."""
         tau = np.asarray(tau, dtype=np.float64)
         return np.asarray(coefficient**2 * self.scale * tau**self.power)
@@ -107,7 +107,7 @@ LAWS: dict[str, NoiseLaw] = {law.symbol: law for law in _LAW_ROWS}
 TERMS = tuple(LAWS)
 
 
-def avar_columns(tau: Any) -> NDArray[np.float64]:
+def avar_columns(tau: Any) -> Floats:
     """Design matrix of the five-term model: Allan variance per squared coefficient.
 
     Parameters
@@ -128,7 +128,7 @@ def avar_columns(tau: Any) -> NDArray[np.float64]:
     return np.stack([law.avar(tau) for law in LAWS.values()], axis=-1)
 
 
-def model_avar(tau: Any, coefficients: Mapping[str, float]) -> NDArray[np.float64]:
+def model_avar(tau: Any, coefficients: Mapping[str, float]) -> Floats:
     """Allan variance [degree2 hour-2] of a sum of terms.
 
     Parameters
@@ -151,7 +151,7 @@ def model_avar(tau: Any, coefficients: Mapping[str, float]) -> NDArray[np.float6
     )
 
 
-def sample_squares(rate: float) -> NDArray[np.float64]:
+def sample_squares(rate: float) -> Floats:
     """Factors from squared coefficients to sample units (interval 1, angles in samples times rate).
 
     Parameters
@@ -170,7 +170,7 @@ def sample_squares(rate: float) -> NDArray[np.float64]:
     return np.asarray(avar_columns(1.0 / rate) / one_sample)
 
 
-def sampled_psd(symbol: str, frequency: Any, rate: float) -> NDArray[np.float64]:
+def sampled_psd(symbol: str, frequency: Any, rate: float) -> Floats:
     """Two-sided PSD of one noise term in samples that are means over their intervals.
 
     Quantization and rate random walk are folded at the Nyquist frequency; flicker noise, whose

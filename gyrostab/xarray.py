@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
 import gyrostab
+from gyrostab.arrays import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -194,7 +194,7 @@ class _FileArray(BackendArray):
             type(key)(tuple(parts)), self.shape, indexing.IndexingSupport.BASIC, self._read_key
         )
 
-    def _read_key(self, key: tuple[Any, ...]) -> NDArray[Any]:
+    def _read_key(self, key: tuple[Any, ...]) -> Array:
         from gyrostab.store.lazy import read_box
 
         single = [not isinstance(part, slice) for part in key]

@@ -6,18 +6,18 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.noise import NORMAL_95
 
 
 def direct_surface(
-    x: NDArray[np.float64],
+    x: Floats,
     window: int,
     step: int,
     ks: list[int],
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Floats, Ints]:
     """Allan variance and number of terms of every window of a rate record, by definition."""
     n_windows = (x.size - window) // step + 1
     avar = np.full((n_windows, len(ks)), np.nan)
@@ -40,8 +40,8 @@ def direct_surface(
 
 
 def direct_angle_surface(
-    theta: NDArray[np.float64], window: int, step: int, ks: list[int], interval: float
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    theta: Floats, window: int, step: int, ks: list[int], interval: float
+) -> tuple[Floats, Ints]:
     """The same for a record of cumulative angles, with ``window + 1`` angles per window."""
     n_windows = (theta.size - 1 - window) // step + 1
     avar = np.full((n_windows, len(ks)), np.nan)
@@ -57,9 +57,7 @@ def direct_angle_surface(
     return avar, count
 
 
-def cluster_cell(
-    x: NDArray[np.float64], k: int, *, stride: int = 1, first: int = 0
-) -> dict[str, float]:
+def cluster_cell(x: Floats, k: int, *, stride: int = 1, first: int = 0) -> dict[str, float]:
     """One cell by weighted cluster means, from a matrix of pairs of clusters (rows) by samples.
 
     Pairs begin where ``first + m`` is a multiple of `stride`. Degrees of freedom are those under
@@ -99,12 +97,12 @@ def cluster_cell(
 
 
 def fit_window_plainly(
-    y: NDArray[np.float64],
-    white: NDArray[np.float64],
-    quantization: NDArray[np.float64],
-    ramp: NDArray[np.float64],
-    factor: NDArray[np.float64],
-    trend: NDArray[np.float64],
+    y: Floats,
+    white: Floats,
+    quantization: Floats,
+    ramp: Floats,
+    factor: Floats,
+    trend: Floats,
     tables: Any,
 ) -> dict[str, Any]:
     """Iterated non-negative generalised least squares of one window, with numpy and scipy.
@@ -129,7 +127,7 @@ def fit_window_plainly(
     thinned *= tables.to_samples[0] ** 2
     z = y - part[:, 0] * trend[4]
 
-    def covariance(s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def covariance(s: Floats) -> Floats:
         ones = np.ones(y.size)
         amounts = np.stack(
             [
@@ -152,7 +150,7 @@ def fit_window_plainly(
         gaps = np.outer(jumps, jumps) + np.diag(thinned)
         return total / np.maximum.outer(factor, factor) + s[0] ** 2 * gaps
 
-    def solve(whitener: NDArray[np.float64]) -> NDArray[np.float64]:
+    def solve(whitener: Floats) -> Floats:
         columns = whitener @ design
         scale = np.linalg.norm(columns, axis=0)
         squares = nnls(columns / scale, whitener @ z, maxiter=1000)[0] / scale
@@ -185,7 +183,7 @@ def fit_window_plainly(
     }
 
 
-def average_plainly(plain: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
+def average_plainly(plain: dict[str, Any]) -> dict[str, Floats]:
     """Average a window of `fit_window_plainly` over the submodels of four terms, with numpy."""
     data, normal = plain["data"], plain["normal"]
     spread = 1.0 / np.sqrt(np.diag(normal))
@@ -235,11 +233,11 @@ def average_plainly(plain: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
         ]
 
         def scatter(
-            fits: list[Any], weights: Any, noise: NDArray[np.float64], a: int = a
+            fits: list[Any], weights: Any, noise: Floats, a: int = a
         ) -> tuple[float, float, float]:
             rows = [fit[2][fit[0].index(a)] for fit in fits]
 
-            def variance(squares: NDArray[np.float64]) -> Any:
+            def variance(squares: Floats) -> Any:
                 covariance = plain["products"](squares)
                 return np.average([row @ covariance @ row for row in rows], weights=weights)
 

@@ -13,7 +13,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BLIND_TEST = sorted((ROOT / "gyrostab" / "blindtest").rglob("*.py"))
-PUBLIC_MODULES = ("gyrostab.errors", "gyrostab.units", "gyrostab.schema", "gyrostab.progress")
+PUBLIC_MODULES = tuple(
+    f"gyrostab.{name}" for name in ("arrays", "errors", "units", "schema", "progress")
+)
 HEAVY = ("matplotlib", "numba", "pyarrow", "netCDF4", "h5py", "scipy.stats")
 
 

@@ -20,13 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.special import gammaincc
 
 from gyrostab.allan.window_fit import FitTables, run_kernel
+from gyrostab.arrays import Floats, Ints
 from gyrostab.kernels.fit.averages import FIT_FIELDS
-
-Array = NDArray[np.float64]
 
 #: Largest number of windows that are averaged. More of them would find departures from the five
 #: terms that no window shows.
@@ -71,7 +69,7 @@ class BandLimit(NamedTuple):
     white_error: float = 0.0  # relative standard error of N by that of the time constant
 
 
-def choose_windows(count: int, window: int, step: int) -> NDArray[np.int64]:
+def choose_windows(count: int, window: int, step: int) -> Ints:
     """Choose windows that do not overlap, at most 24, spread over the record.
 
     Examples
@@ -84,7 +82,7 @@ def choose_windows(count: int, window: int, step: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, count - 1, number).round().astype(np.int64))
 
 
-def filter_response(tau: Array, time_constant: float | Array) -> Array:
+def filter_response(tau: Floats, time_constant: float | Floats) -> Floats:
     """Compute the share of the Allan variance of white noise that a filter leaves.
 
     Examples
@@ -110,7 +108,7 @@ def low_pass_response(tau: float, time_constant: float) -> float:
     return float(1.0 - (2.0 * shares[0] - 0.5 * shares[1]) / ratio)
 
 
-def limit_response(product: xr.Dataset, tau: Array) -> Array:
+def limit_response(product: xr.Dataset, tau: Floats) -> Floats:
     """Compute the share of the Allan variance of white noise that the filter leaves, of a product.
 
     Parameters
@@ -135,10 +133,10 @@ def limit_response(product: xr.Dataset, tau: Array) -> Array:
 
 
 def find_band_limit(
-    tau: Array,
-    cells: Sequence[Array],
-    trend: Array,
-    trend_responses: Array,
+    tau: Floats,
+    cells: Sequence[Floats],
+    trend: Floats,
+    trend_responses: Floats,
     *,
     allowed: int,
     tables: FitTables,
@@ -201,14 +199,14 @@ def _round_number(value: float) -> float:
 class _Mean(NamedTuple):
     """Average of windows: rows as of a window, trend and its responses, number of windows."""
 
-    tau: Array
-    rows: list[Array]
+    tau: Floats
+    rows: list[Floats]
     trend: float
-    responses: Array
+    responses: Floats
     windows: int
     tables: FitTables
 
-    def fit_each(self, start: int, constants: Array, terms: int) -> tuple[Array, Array, Array]:
+    def fit_each(self, start: int, constants: Floats, terms: int) -> tuple[Floats, Floats, Floats]:
         """Fit from a position on: squares, chi-square and degrees of freedom of each constant."""
         rows = [np.tile(values, (constants.size, 1)) for values in self.rows]
         rows[0][:, :start] = np.nan
@@ -219,7 +217,7 @@ class _Mean(NamedTuple):
         squares = result[:, FIT_FIELDS.index("square")]
         return squares, misfit[:, 0] * self.windows, misfit[:, 1]
 
-    def fit(self, start: int, constants: Array, terms: int) -> tuple[int, Array, float]:
+    def fit(self, start: int, constants: Floats, terms: int) -> tuple[int, Floats, float]:
         """Fit from a position on: best constant, squares, probability of its misfit.
 
         The probability is NaN without degrees of freedom.
@@ -231,7 +229,7 @@ class _Mean(NamedTuple):
 
 
 def _average_windows(
-    tau: Array, cells: Sequence[Array], trend: Array, responses: Array, tables: FitTables
+    tau: Floats, cells: Sequence[Floats], trend: Floats, responses: Floats, tables: FitTables
 ) -> _Mean | None:
     """Average the windows without motion, each over its variance at the shortest averaging time."""
     level = cells[0][:, 0]
@@ -269,7 +267,7 @@ def _find_white_error(mean: _Mean, start: int, constant: float, allowed: int) ->
     return float(0.5 * abs(slope) * np.sqrt(2.0 / curvature)) if curvature > 0 else 0.0
 
 
-def _fit_constant(mean: _Mean, start: int, allowed: int) -> tuple[float, Array, float]:
+def _fit_constant(mean: _Mean, start: int, allowed: int) -> tuple[float, Floats, float]:
     """Fit the time constant of a filter from a position on, without Q."""
     low, highest = 0.0, _MAX_TIME_CONSTANT * mean.tau[start]
     high = highest

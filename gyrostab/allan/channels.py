@@ -9,8 +9,8 @@ import dask
 import dask.array as da
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import TimeError
 from gyrostab.kernels.regression.trend import window_trend
 from gyrostab.schema import find_unusable_channels, log_channels
@@ -100,11 +100,11 @@ def window_channels(
 
 def _fit_trends(
     values: Any,
-    stamps: NDArray[np.int64] | None,
+    stamps: Ints | None,
     rate: float,
-    a: NDArray[np.int64],
-    b: NDArray[np.int64],
-) -> NDArray[np.float64]:
+    a: Ints,
+    b: Ints,
+) -> Floats:
     data = np.ascontiguousarray(fill_masked(values), dtype=np.float64)
     seconds = np.arange(data.size) / rate if stamps is None else (stamps - stamps[:1]) / 1e9
     return np.asarray(window_trend(data, seconds, a, b))
@@ -112,9 +112,9 @@ def _fit_trends(
 
 def _find_trends(
     data: Any,
-    stamps: NDArray[np.int64] | None,
+    stamps: Ints | None,
     rate: float,
-    bounds: Sequence[NDArray[np.int64]],
+    bounds: Sequence[Ints],
     *,
     lazy: bool,
 ) -> Any:

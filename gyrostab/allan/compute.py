@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 
 from gyrostab.allan.freedoms import NoiseTables, estimate_freedoms, make_noise_tables
 from gyrostab.allan.plan import Plan, last_sample, units_of_work
+from gyrostab.arrays import Array, Floats
 from gyrostab.kernels.allan.biased_samples import count_outliers, gap_edge_ratio
 from gyrostab.kernels.allan.surface import Cells, Unit, convert_to_native, surface_unit
 from gyrostab.kernels.workspace import Workspace, Workspaces
 from gyrostab.store.lazy import find_source, keep_sources, read_into, read_slice
 from gyrostab.units import HOUR
-
-Floats = NDArray[np.float64]
 
 #: Variables by axis, window and averaging time, in the order in which `_compute_unit` returns them.
 CELL_FIELDS = (*Cells._fields, "edf")
@@ -109,7 +108,7 @@ def _stack_unit(x: NDArray[np.generic], unit: Unit, tables: NoiseTables) -> tupl
 
 def compute_windows(
     plan: Plan, groups: Sequence[slice], space: Workspace
-) -> tuple[list[NDArray[Any]], Floats]:
+) -> tuple[list[Array], Floats]:
     """Compute groups of windows, as `run_units` does, immediately and in the calling thread."""
     unit, tables = plan.unit, make_noise_tables(plan)
     spans = [(group.start * unit.step, last_sample(group, unit)) for group in groups]
@@ -119,7 +118,7 @@ def compute_windows(
 
 def _join_units(
     results: Sequence[tuple[list[Floats], Floats]], plan: Plan
-) -> tuple[list[NDArray[Any]], Floats]:
+) -> tuple[list[Array], Floats]:
     """Join units, axis by axis: fields (axis, time, tau), plane fields (9, axis, time).
 
     A field that is the same in all windows is stored once, and repeated as a view.
@@ -133,7 +132,7 @@ def _join_units(
     return fields, means.reshape(len(PLANE_FIELDS), n_axes, -1)
 
 
-def _join_field(parts: list[Floats], sizes: list[int], n_axes: int, kind: Any) -> NDArray[Any]:
+def _join_field(parts: list[Floats], sizes: list[int], n_axes: int, kind: Any) -> Array:
     shape = n_axes, sum(sizes) // n_axes, parts[0].shape[1]
     parts = [part.astype(kind, copy=False) for part in parts]
     if all(part.shape[0] == 1 and np.array_equal(part, parts[0], equal_nan=True) for part in parts):

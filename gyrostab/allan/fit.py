@@ -8,11 +8,11 @@ from typing import Any
 import dask.array as da
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.allan.band_limit import BandLimit, choose_windows, filter_response, find_band_limit
 from gyrostab.allan.fit_inputs import FIT_VARIABLES, check_options, prepare_fit, term_bits
 from gyrostab.allan.window_fit import fit_block
+from gyrostab.arrays import Floats, Ints
 from gyrostab.kernels.fit.covariance import STOCHASTIC
 from gyrostab.noise import TERMS
 from gyrostab.schema import attributes, with_axis
@@ -268,7 +268,7 @@ def find_bands(
 def _fit_windows(
     surface: xr.Dataset,
     allowed: int,
-    within: NDArray[np.int64],
+    within: Ints,
     limits: list[BandLimit],
     *,
     immediate: bool,
@@ -287,7 +287,7 @@ def _fit_windows(
         cells[1] = cells[1] * filter_response(tau, constant)
     cells += [np.broadcast_to(values, cells[-1].shape) for values in (constant, error)]
 
-    def block(*arrays: NDArray[np.float64]) -> NDArray[np.float64]:
+    def block(*arrays: Floats) -> Floats:
         flat = [
             np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64)
             for a in arrays[:5]

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.allan.compute import TREND_RESPONSES
 from gyrostab.allan.freedoms import thin_factors
 from gyrostab.allan.window_fit import FitTables, fit_tables
+from gyrostab.arrays import Ints
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.fit.covariance import STOCHASTIC
 from gyrostab.noise import TERMS
@@ -74,7 +74,7 @@ def check_fit_options(
 
 def check_options(
     surface: xr.Dataset, terms: str | Iterable[str], tau_min: Any, tau_max: Any
-) -> tuple[list[str], NDArray[np.int64]]:
+) -> tuple[list[str], Ints]:
     """Check the options of a fit; return the terms, and the positions of the averaging times."""
     check_surface(surface)
     fitted_terms, low, high = check_fit_options(terms, tau_min, tau_max)
@@ -93,9 +93,7 @@ def check_options(
     return fitted_terms, chosen
 
 
-def fit_inputs(
-    surface: xr.Dataset, allowed: int = 31
-) -> tuple[list[Any], NDArray[np.int64], float, int]:
+def fit_inputs(surface: xr.Dataset, allowed: int = 31) -> tuple[list[Any], Ints, float, int]:
     """Collect the cells as (axis, time, tau) arrays, averaging factors, rate and window length.
 
     Trend and its responses follow, and whether its product with the noise is removed (axis, time,
@@ -134,8 +132,8 @@ def fit_inputs(
 
 
 def prepare_fit(
-    surface: xr.Dataset, within: NDArray[np.int64], allowed: int
-) -> tuple[list[Any], FitTables, NDArray[np.int64]]:
+    surface: xr.Dataset, within: Ints, allowed: int
+) -> tuple[list[Any], FitTables, Ints]:
     """Return the cells of a surface, and tables and positions of the averaging times to fit."""
     cells, ks, rate, window = fit_inputs(surface, allowed)
     chosen = within[thin_factors(ks[within])]

@@ -9,9 +9,9 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gyrostab.allan.variance import variance_columns, white_freedoms
+from gyrostab.arrays import Floats, Ints
 from gyrostab.kernels.allan.clusters import cluster_strides
 from gyrostab.kernels.allan.surface import Cells
 from gyrostab.kernels.fit.covariance import product_tables
@@ -23,14 +23,12 @@ from gyrostab.noise import sample_squares
 if TYPE_CHECKING:
     from gyrostab.allan.plan import Plan
 
-Floats = NDArray[np.float64]
-
 #: Largest number of averaging times in a fit; more add no information and cost the cube of their
 #: number.
 MOST_TAUS = 48
 
 
-def thin_factors(ks: NDArray[np.int64]) -> NDArray[np.int64]:
+def thin_factors(ks: Ints) -> Ints:
     """Choose the averaging factors to fit: all, or `MOST_TAUS` of them, evenly spaced in log."""
     if ks.size <= MOST_TAUS:
         return np.arange(ks.size)
@@ -41,7 +39,7 @@ def thin_factors(ks: NDArray[np.int64]) -> NDArray[np.int64]:
 class NoiseTables(NamedTuple):
     """Arguments of `identify_noise` and `cell_freedoms` that all windows share."""
 
-    chosen: NDArray[np.int64]
+    chosen: Ints
     columns: Floats
     weight: Floats
     to_samples: Floats

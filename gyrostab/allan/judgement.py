@@ -7,8 +7,8 @@ from itertools import zip_longest
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools
 from gyrostab.noise import LAWS
 from gyrostab.schema import OBSERVED, check_product, is_rate_of_change, texts
 from gyrostab.time.durations import format_duration
@@ -180,7 +180,7 @@ def _judge_changes(product: xr.Dataset, changes: dict[tuple[str, str], dict[str,
     return f"{term} {change} by a factor of {sizes} while {name} is high."
 
 
-def _find_states(product: xr.Dataset) -> list[tuple[str, NDArray[np.bool_], NDArray[np.bool_]]]:
+def _find_states(product: xr.Dataset) -> list[tuple[str, Bools, Bools]]:
     """List the channels that change, with the windows in the lowest and highest quarter."""
     states = []
     for name, channel in product.data_vars.items():
@@ -199,9 +199,7 @@ def _find_states(product: xr.Dataset) -> list[tuple[str, NDArray[np.bool_], NDAr
     return states
 
 
-def _compare_states(
-    part: xr.Dataset, term: str, low: NDArray[np.bool_], high: NDArray[np.bool_]
-) -> tuple[float, str]:
+def _compare_states(part: xr.Dataset, term: str, low: Bools, high: Bools) -> tuple[float, str]:
     """Compare a term between two states: ratio of the medians, and the only state that shows it."""
     observed = part["observable"].sel(term=term).values == OBSERVED
     values = part[term].values

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import OptionError
 from gyrostab.kernels.allan.surface import Unit
 from gyrostab.kernels.allan.variances import VARIANCES
@@ -34,10 +34,10 @@ class Plan(NamedTuple):
     rate: float
     attrs: dict[str, Any]
     #: Averaging factors of `unit` that were asked for; the noise is identified from all of them.
-    reported: slice | NDArray[np.int64]
+    reported: slice | Ints
 
     @property
-    def taus(self) -> NDArray[np.float64]:
+    def taus(self) -> Floats:
         """Averaging times of the surface [s]."""
         return np.asarray(self.unit.ks[self.reported] / self.rate)
 
@@ -79,7 +79,7 @@ def make_plan(
     return Plan(signal, unit, rate, attrs, reported)
 
 
-def _fill_octaves(ks: NDArray[np.int64]) -> NDArray[np.int64]:
+def _fill_octaves(ks: Ints) -> Ints:
     """Add averaging factors until neighbours, from 1 on, are at most an octave apart.
 
     The degrees of freedom depend on the kind of noise, which a few long averaging times do not

@@ -7,11 +7,11 @@ from typing import Literal
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.allan.fit import refit
 from gyrostab.allan.judgement import judge_product
 from gyrostab.allan.window_fit import is_described
+from gyrostab.arrays import Bools, Floats
 from gyrostab.noise import LAWS
 from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY, check_product
 from gyrostab.wording import format_share
@@ -137,7 +137,7 @@ def _summarise_term(part: xr.Dataset, axis: str, symbol: str) -> TermSummary:
     )
 
 
-def _drop_nans(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _drop_nans(values: Floats) -> Floats:
     return values[np.isfinite(values)]
 
 
@@ -276,7 +276,7 @@ def _share_or_all(share: float) -> str:
     return "all" if share == 1.0 else format_share(share)
 
 
-def _count_windows(affected: NDArray[np.bool_]) -> str:
+def _count_windows(affected: Bools) -> str:
     """Return the number of affected windows in words.
 
     Examples

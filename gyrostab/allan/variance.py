@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.kernels.allan.pairs import white_pair_sum
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.fit.covariance import third_columns
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def variance_columns(variance: str, ks: NDArray[np.int64], rate: float) -> NDArray[np.float64]:
+def variance_columns(variance: str, ks: Ints, rate: float) -> Floats:
     """Compute the design matrix of the five-term model: the variance per squared coefficient.
 
     Parameters
@@ -38,9 +38,7 @@ def variance_columns(variance: str, ks: NDArray[np.int64], rate: float) -> NDArr
     return third_columns(variance, ks) * sample_squares(rate)
 
 
-def white_freedoms(
-    variance: str, window: int, ks: NDArray[np.int64], pairs: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def white_freedoms(variance: str, window: int, ks: Ints, pairs: Floats) -> Floats:
     """Compute the degrees of freedom under white noise, (n_tau,).
 
     `pairs` (4, 4, n_tau) holds the variance of each cell per product of squares, see
@@ -57,7 +55,7 @@ def variance_name(surface: xr.Dataset) -> str:
     return VARIANCES[surface.attrs.get("variance", "avar")].text
 
 
-def surface_columns(surface: xr.Dataset) -> NDArray[np.float64]:
+def surface_columns(surface: xr.Dataset) -> Floats:
     """Compute the `variance_columns` of the averaging times of a surface, (n_tau, 5)."""
     rate = float(surface.attrs["sampling_rate_hz"])
     ks = np.rint(np.asarray(surface["tau"].values) * rate).astype(np.int64)

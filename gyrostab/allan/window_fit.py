@@ -6,10 +6,10 @@ from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincc, gammaincinv
 
 from gyrostab.allan.variance import variance_columns, white_freedoms
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.kernels.allan.clusters import cluster_strides
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compile_ahead import await_compilation
@@ -67,7 +67,7 @@ def is_described(chi2: Any, dof: Any) -> Any:
 class FitTables:
     """Tables that all windows of a surface share."""
 
-    def __init__(self, ks: NDArray[np.int64], rate: float, window: int, variance: str = "avar"):
+    def __init__(self, ks: Ints, rate: float, window: int, variance: str = "avar"):
         self.columns = variance_columns(variance, ks, rate)
         self.to_samples = sample_squares(rate)
         self.pairs, self.ramps = product_tables(window, ks, variance=variance)
@@ -94,12 +94,12 @@ class FitTables:
         return self._detrend()
 
     @property
-    def trend_variance(self) -> NDArray[np.float64]:
+    def trend_variance(self) -> Floats:
         """Variance of the trend of a window per squared coefficient [degree2 hour-4]."""
         return self.trend.variance * self.to_samples[:STOCHASTIC] * (self._rate * HOUR) ** 2
 
 
-def quantile_curve(level: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def quantile_curve(level: float) -> tuple[Floats, Floats]:
     """Tabulate the quantile q at `level` of chi-square over its degrees of freedom nu.
 
     Returns ln nu and ``nu ln q`` for `chi_square_quantile`. A step of 0.005 in ln nu leaves a
@@ -119,16 +119,16 @@ def fit_tables(ks: tuple[int, ...], rate: float, window: int, variance: str = "a
 
 
 def fit_block(
-    flat: list[NDArray[np.float64]],
-    trend: NDArray[np.float64],
-    responses: NDArray[np.float64],
-    exact: NDArray[np.float64],
+    flat: list[Floats],
+    trend: Floats,
+    responses: Floats,
+    exact: Floats,
     tables: FitTables,
     *,
-    white_error: NDArray[np.float64],
+    white_error: Floats,
     allowed: int,
     observed_only: bool,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Fit windows: coefficients, errors, limits, observability, chi2, dof and edf as columns.
 
     `responses` (n_windows, 4) is the variance of the trend under Q, N, B and K, as a share of that
@@ -159,13 +159,13 @@ def fit_block(
 
 
 def run_kernel(
-    flat: list[NDArray[np.float64]],
-    trend: NDArray[np.float64],
-    responses: NDArray[np.float64],
-    exact: NDArray[np.float64],
+    flat: list[Floats],
+    trend: Floats,
+    responses: Floats,
+    exact: Floats,
     tables: FitTables,
     allowed: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats, Floats]:
     """Run `fit_windows`, less the trend if a ramp is allowed; other terms are NaN."""
     trends = np.zeros((trend.size, STOCHASTIC + 2))
     pairs, ramps = tables.pairs, tables.ramps
@@ -185,7 +185,7 @@ def run_kernel(
     return result, misfit, dof
 
 
-def _exceed_chance(field: dict[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
+def _exceed_chance(field: dict[str, Floats]) -> Bools:
     """Find the terms that noise without them exceeds in 1 % of windows, at most 3 %.
 
     The likelihood ratio of the best submodels with and without the term must exceed chance, for a
@@ -196,7 +196,7 @@ def _exceed_chance(field: dict[str, NDArray[np.float64]]) -> NDArray[np.bool_]:
     return np.asarray(exceeds)
 
 
-def _trend_error(field: dict[str, NDArray[np.float64]], sigma: float) -> NDArray[np.float64]:
+def _trend_error(field: dict[str, Floats], sigma: float) -> Floats:
     """Compute the standard error of the trend, of which `sigma` give an interval.
 
     The variance v of the trend follows from the fitted noise, with a standard error w. To first
@@ -211,9 +211,7 @@ def _trend_error(field: dict[str, NDArray[np.float64]], sigma: float) -> NDArray
     return np.sqrt(variance * (1.0 + wider))
 
 
-def _widen_misfits(
-    field: dict[str, NDArray[np.float64]], misfit: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def _widen_misfits(field: dict[str, Floats], misfit: Floats) -> Bools:
     """Find the windows that the model does not fit, and scale their variances by chi2 / dof."""
     chi2, dof = misfit.T
     fails = ~is_described(chi2, dof)
@@ -224,9 +222,7 @@ def _widen_misfits(
     return np.asarray(fails)
 
 
-def _bound_estimates(
-    field: dict[str, NDArray[np.float64]], value: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _bound_estimates(field: dict[str, Floats], value: Floats) -> tuple[Floats, Floats]:
     """Find standard errors of coefficients, and 95 % upper limits of their squares.
 
     Interval and limit follow from `estimate_bounds`; the lower end of an interval has another law
@@ -247,9 +243,7 @@ def _bound_estimates(
     return stderr, limit
 
 
-def _solve_bounds(
-    field: dict[str, NDArray[np.float64]], estimate: str, law: str, *scores: float
-) -> NDArray[np.float64]:
+def _solve_bounds(field: dict[str, Floats], estimate: str, law: str, *scores: float) -> Floats:
     """Run `estimate_bounds` on one of the estimates and its law, for (score, window, term)."""
     parts = [field[name] for name in (estimate, *(f"{law}_{n}" for n in _POWERS))]
     bounds = estimate_bounds(*(np.ravel(part) for part in parts), np.array(scores))
@@ -257,11 +251,11 @@ def _solve_bounds(
 
 
 def _limit_of_curve(
-    flat: list[NDArray[np.float64]],
-    square: NDArray[np.float64],
-    dof: NDArray[np.float64],
+    flat: list[Floats],
+    square: Floats,
+    dof: Floats,
     tables: FitTables,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Find the 95 % upper limit of a squared coefficient without assuming the five-term model.
 
     The part of a term cannot exceed the whole curve, because anything else in a cell, noise or not,

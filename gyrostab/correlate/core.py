@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.correlate.dataset import assemble
 from gyrostab.correlate.drivers import Driver, align_drivers, other_channels
 from gyrostab.correlate.fit import (
@@ -27,7 +27,6 @@ from gyrostab.noise import TERMS
 from gyrostab.schema import OBSERVED, check_product, with_axis
 from gyrostab.time.durations import duration_seconds
 
-Array = NDArray[np.float64]
 _MAX_LAGS = 48
 #: Share of the samples of a window from which on it is used.
 _MIN_COVERAGE = 0.05
@@ -199,7 +198,7 @@ def _select_variables(product: xr.Dataset, variables: str | Sequence[str] | None
     return names
 
 
-def _window_lengths(product: xr.Dataset, time: Array) -> tuple[float, float]:
+def _window_lengths(product: xr.Dataset, time: Floats) -> tuple[float, float]:
     """Find length and step of the windows [s]."""
     bounds = product["time_bounds"].values
     length = float(np.median(bounds[:, 1] - bounds[:, 0]) / np.timedelta64(1, "s"))
@@ -207,7 +206,7 @@ def _window_lengths(product: xr.Dataset, time: Array) -> tuple[float, float]:
     return length, float(product.attrs.get("step_s", spacing))
 
 
-def _choose_lags(max_lag: Any, span: float, step: float) -> NDArray[np.int64]:
+def _choose_lags(max_lag: Any, span: float, step: float) -> Ints:
     longest = 0.1 * span if max_lag is None else duration_seconds(max_lag, "max_lag", zero=True)
     if longest > span:
         raise OptionError(
@@ -219,7 +218,7 @@ def _choose_lags(max_lag: Any, span: float, step: float) -> NDArray[np.int64]:
     )
 
 
-def _usable_series(product: xr.Dataset, name: str, axis: int) -> Array:
+def _usable_series(product: xr.Dataset, name: str, axis: int) -> Floats:
     """Return a variable by window, NaN where it is not observed or almost no sample is present."""
     part = product.isel(axis=axis)
     if name == "window_coverage":
@@ -230,7 +229,7 @@ def _usable_series(product: xr.Dataset, name: str, axis: int) -> Array:
     return np.where(good, part[name].values, np.nan)
 
 
-def _known_windows(drivers: list[Driver]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+def _known_windows(drivers: list[Driver]) -> tuple[Bools, Ints]:
     """Find the windows in which each driver is known at every lag, and its number of lags.
 
     Lags that would cost more than a third of the windows are left out.

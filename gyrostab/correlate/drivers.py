@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import MissingUnitError, OptionError, SchemaError, TimeError, UnitError
 from gyrostab.kernels.regression.trend import window_trend
 from gyrostab.schema import is_rate_of_change
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import HOUR, INNER, parse_unit
-
-Array = NDArray[np.float64]
 
 # A gap is bridged if it is at most as long as a window or this many sample spacings of the channel.
 MAX_GAP_SPACINGS = 3.0
@@ -36,7 +34,7 @@ class Driver:
     name: str
     label: str
     units: str
-    values: Array
+    values: Floats
     derived: bool = False
     of_product: bool = False
 
@@ -44,7 +42,7 @@ class Driver:
 def align_drivers(
     product: xr.Dataset,
     channels: Sequence[str | xr.DataArray],
-    lags: NDArray[np.int64],
+    lags: Ints,
     step: float,
 ) -> list[Driver]:
     """Average channels over the windows, for every lag.
@@ -87,7 +85,7 @@ def align_drivers(
 
 
 def _align_channel(
-    product: xr.Dataset, channel: str | xr.DataArray, lags: NDArray[np.int64], step: float
+    product: xr.Dataset, channel: str | xr.DataArray, lags: Ints, step: float
 ) -> list[Driver]:
     """Average a channel and its rate of change over the windows, for every lag."""
     if isinstance(channel, str):
@@ -162,20 +160,18 @@ def _channel_names(product: xr.Dataset) -> list[str]:
     return [str(name) for name in numeric]
 
 
-def _grid_positions(product: xr.Dataset, step: float) -> NDArray[np.int64]:
+def _grid_positions(product: xr.Dataset, step: float) -> Ints:
     time = to_nanoseconds(product["time"].values)
     return np.asarray(np.rint((time - time[0]) / 1e9 / step), dtype=np.int64)
 
 
-def _shift_by_lags(
-    series: Array, lead: int, place: NDArray[np.int64], lags: NDArray[np.int64]
-) -> Array:
+def _shift_by_lags(series: Floats, lead: int, place: Ints, lags: Ints) -> Floats:
     """Take the values one lag earlier, for each lag; `series` begins `lead` steps early."""
     at = place[None, :] - lags[:, None] + lead
     return np.where(at >= 0, series[np.maximum(at, 0)], np.nan)
 
 
-def _bridge_gaps(series: Array, max_windows: float) -> Array:
+def _bridge_gaps(series: Floats, max_windows: float) -> Floats:
     """Interpolate over gaps of at most `max_windows` windows, in place; nothing is extrapolated."""
     present = np.flatnonzero(np.isfinite(series))
     wide = np.diff(present)
@@ -191,9 +187,7 @@ def _window_length_ns(product: xr.Dataset) -> int:
     return int(np.median(bounds[:, 1] - bounds[:, 0]))
 
 
-def _align_product_channel(
-    product: xr.Dataset, name: str, lags: NDArray[np.int64], step: float
-) -> list[Array]:
+def _align_product_channel(product: xr.Dataset, name: str, lags: Ints, step: float) -> list[Floats]:
     place = _grid_positions(product, step)
     mean = np.full(int(place[-1]) + 1, np.nan)
     mean[place] = product[name].values
@@ -215,7 +209,7 @@ def _align_product_channel(
     return [_shift_by_lags(row, 0, place, lags) for row in (mean, rate)]
 
 
-def _difference_means(mean: Array, step: float) -> Array:
+def _difference_means(mean: Floats, step: float) -> Floats:
     """Differentiate a row of window means [per hour] by central differences."""
     slope = np.full(mean.size, np.nan)
     slope[1:-1] = (mean[2:] - mean[:-2]) / (2.0 * step / HOUR)
@@ -223,8 +217,8 @@ def _difference_means(mean: Array, step: float) -> Array:
 
 
 def _align_file_channel(
-    channel: xr.DataArray, product: xr.Dataset, lags: NDArray[np.int64], step: float
-) -> list[Array]:
+    channel: xr.DataArray, product: xr.Dataset, lags: Ints, step: float
+) -> list[Floats]:
     """Average and differentiate a channel with a separate time coordinate over the windows.
 
     A channel with fewer than two values per window is interpolated to the window centres instead.
@@ -251,9 +245,7 @@ def _align_file_channel(
     return [_shift_by_lags(row, lead, place, lags) for row in (mean, rate)]
 
 
-def interpolate_values(
-    values: Array, stamps: NDArray[np.int64], at: NDArray[np.int64], longest: float
-) -> Array:
+def interpolate_values(values: Floats, stamps: Ints, at: Ints, longest: float) -> Floats:
     """Interpolate between values that are at most `longest` apart; NaN elsewhere."""
     following = np.clip(np.searchsorted(stamps, at), 1, max(stamps.size - 1, 1))
     if stamps.size < 2:
@@ -267,7 +259,7 @@ def interpolate_values(
     )
 
 
-def _check_channel(channel: xr.DataArray, product: xr.Dataset) -> tuple[Array, NDArray[np.int64]]:
+def _check_channel(channel: xr.DataArray, product: xr.Dataset) -> tuple[Floats, Ints]:
     if channel.ndim != 1 or channel.dtype.kind not in "iuf":
         raise SchemaError(
             f"channel {channel.name!r} must hold numbers along one dimension, time; it has "

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.correlate.drivers import Driver
 from gyrostab.correlate.judge import driver_limits
 from gyrostab.kernels.regression.coupling import (
@@ -26,7 +26,6 @@ from gyrostab.kernels.regression.coupling import (
     weights,
 )
 
-Array = NDArray[np.float64]
 _MAX_BLOCKS = 160  # longer records are averaged further
 _MAX_SIMULATED_LAGS = 12  # in the simulation of the search; lags in between add no information
 _MAX_WINDOWS_PER_LENGTH = 8  # more add no information
@@ -52,15 +51,15 @@ class Blocks(NamedTuple):
     """Blocks of the windows that some series share, and the model terms besides the driver."""
 
     average: Any
-    windows: NDArray[np.int64]
-    pieces: NDArray[np.int64]
-    offsets: Array
-    trend: Array
+    windows: Ints
+    pieces: Ints
+    offsets: Floats
+    trend: Floats
     laws: Laws
 
 
 def make_blocks(
-    mask: NDArray[np.bool_], time: Array, length: float, step: float, share: Array
+    mask: Bools, time: Floats, length: float, step: float, share: Floats
 ) -> Blocks | None:
     """Group windows into blocks at least as long as a window; None if there are too few."""
     windows = np.flatnonzero(mask)
@@ -93,10 +92,10 @@ def make_blocks(
 
 def fit_driver(
     blocks: Blocks | None,
-    series: Array,
+    series: Floats,
     driver: Driver,
-    other_series: list[Array],
-    lags: Array,
+    other_series: list[Floats],
+    lags: Floats,
     level: float,
 ) -> list[dict[str, Any]]:
     """Fit one driver to series (rows) that share their windows, with one entry per series."""
@@ -166,7 +165,7 @@ def fit_driver(
 
 def fit_partial_effects(
     blocks: Blocks | None,
-    series: Array,
+    series: Floats,
     drivers: list[Driver],
     entries: Sequence[dict[str, Any]],
     level: float,
@@ -199,13 +198,13 @@ def fit_partial_effects(
         entries[d].update({partial: sensitivity[name] for name, partial in _PARTIAL.items()})
 
 
-def _unexplained_share(x: Array, columns: Array) -> float:
+def _unexplained_share(x: Floats, columns: Floats) -> float:
     """Compute the share of the variance of a series that a linear fit leaves."""
     return float(np.sum(_subtract_fit(x, columns) ** 2) / max(float(np.var(x)) * x.size, 1e-300))
 
 
 def _estimate_sensitivity(
-    laws: Laws, y: Array, x: Array, lags: Array, level: float
+    laws: Laws, y: Floats, x: Floats, lags: Floats, level: float
 ) -> dict[str, Any]:
     """Find lag, slope and interval of one series, and its p-values at that lag and at any lag.
 
@@ -242,7 +241,7 @@ def _estimate_sensitivity(
     return entry | {"slope": slope, "stderr": error, "low": low, "high": high}
 
 
-def _law_covariance(blocks: Blocks, law: int) -> Array:
+def _law_covariance(blocks: Blocks, law: int) -> Floats:
     return np.asarray(blocks.laws.factor[law] @ blocks.laws.factor[law].T)
 
 
@@ -252,29 +251,29 @@ def _empty_entry(limits: set[str], *, windows: int = 0) -> dict[str, Any]:
     return {**dict.fromkeys(names.split(), np.nan), "limits": limits, "windows": windows}
 
 
-def _largest_leverage(x: Array, columns: Array) -> float:
+def _largest_leverage(x: Floats, columns: Floats) -> float:
     """Find the largest share of one block in the variance of the driver."""
     squares = _subtract_fit(x, columns) ** 2
     return float(squares.max() / max(float(squares.sum()), 1e-300))
 
 
-def _subtract_fit(x: Array, columns: Array) -> Array:
+def _subtract_fit(x: Floats, columns: Floats) -> Floats:
     """Return what the least-squares fit of the `columns` leaves of a series."""
     q, _ = np.linalg.qr(columns)
     return np.asarray(x - q @ (q.T @ x))
 
 
-def _standardise_series(row: Array) -> Array:
+def _standardise_series(row: Floats) -> Floats:
     return np.asarray((row - row.mean()) / np.std(row))
 
 
-def _partial_correlation(y: Array, x: Array, columns: Array) -> float:
+def _partial_correlation(y: Floats, x: Floats, columns: Floats) -> float:
     y, x = _subtract_fit(y, columns), _subtract_fit(x, columns)
     size = float(np.sqrt((y @ y) * (x @ x)))
     return float(np.clip(y @ x / size, -1.0, 1.0)) if size > 0 else np.nan
 
 
-def _effective_samples(y: Array, x: Array, nuisance: Array, error: float) -> float:
+def _effective_samples(y: Floats, x: Floats, nuisance: Floats, error: float) -> float:
     """Count the independent samples whose ordinary regression would have this standard error.
 
     The count is at most the number of blocks.
@@ -289,7 +288,9 @@ def _effective_samples(y: Array, x: Array, nuisance: Array, error: float) -> flo
     return float(min(y.size, samples + nuisance.shape[1] + 1))
 
 
-def _fit_ramps(blocks: Blocks, law: int, nuisance: Array, y: Array, x: Array) -> dict[str, float]:
+def _fit_ramps(
+    blocks: Blocks, law: int, nuisance: Floats, y: Floats, x: Floats
+) -> dict[str, float]:
     """Fit the slope while the driver rises and while it falls, each with a separate constant."""
     rises = np.gradient(x[:, 0]) > 0
     covariance = _law_covariance(blocks, law)

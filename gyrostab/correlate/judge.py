@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.correlate.drivers import slope_units
-
-Array = NDArray[np.float64]
 
 #: Flag values of ``coupling_verdict``.
 VERDICTS = ("cannot_tell", "none_seen", "not_told_apart", "coupled")
@@ -35,7 +33,7 @@ _READABLE = {"degree": "deg", "hour": "h", "degree_Celsius": "K", "standard_free
 _MIN_RANGE = {"degree_Celsius": 0.02}  # a channel with a smaller range counts as constant
 
 
-def driver_limits(x: Array, pieces: NDArray[np.int64], units: str, *, derived: bool) -> set[str]:
+def driver_limits(x: Floats, pieces: Ints, units: str, *, derived: bool) -> set[str]:
     """List what limits a verdict on a driver.
 
     Parameters

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.identify.examination import Identifications
@@ -192,7 +192,7 @@ class Task:
         """Reduce a log to block statistics."""
         return reduce_log(log, block=block, restart_gap=self.restart_gap, progress=self.progress)
 
-    def without_motion(self, blocks: xr.Dataset, moving: NDArray[np.bool_]) -> xr.Dataset:
+    def without_motion(self, blocks: xr.Dataset, moving: Bools) -> xr.Dataset:
         """Return the block statistics of the recording without the moving blocks."""
         return without_motion(
             self.log, blocks, moving, restart_gap=self.restart_gap, progress=self.progress
@@ -218,7 +218,7 @@ def lines_without_motion(task: Task, blocks: xr.Dataset, known: xr.Dataset) -> x
     )
 
 
-def take_lines_at_rest(task: Task, blocks: xr.Dataset, moving: NDArray[np.bool_]) -> xr.Dataset:
+def take_lines_at_rest(task: Task, blocks: xr.Dataset, moving: Bools) -> xr.Dataset:
     """Return the blocks with line spectra from those in which an axis does not move.
 
     A step within a block has a broad spectrum, and all blocks in a part of the record share one

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
 from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Spool
 from gyrostab.ingest.columns.stamps import CLOCK_PERIODS, NAT, read_stamps, typical_step
@@ -110,7 +110,7 @@ def _find_turns(step: int, first: int, typical: float) -> tuple[int, int]:
 def _move_stamps(part: xr.Dataset, added: int) -> xr.Dataset:
     """Add a time [ns] to the stamps of a raw log."""
 
-    def move(stamps: NDArray[Any]) -> NDArray[Any]:
+    def move(stamps: Array) -> Array:
         return np.asarray(stamps + np.timedelta64(added, "ns"))
 
     data = part["time"].data
@@ -303,7 +303,7 @@ def _files_without(groups: list[list[xr.Dataset]], holders: set[int]) -> list[st
 
 def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
     """Add the channels of other files, each on ``time_<channel>`` with its filled rows only."""
-    pieces: dict[str, list[tuple[NDArray[Any], NDArray[Any], str]]] = {}
+    pieces: dict[str, list[tuple[Array, Array, str]]] = {}
     files = [source.attrs["source_files"][0] for source in sources]
     for name, source in zip(files, sources, strict=True):
         for channel, stamps, values, units in _read_channels(source, name):
@@ -314,12 +314,12 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
                 raise OptionError(f"channel {channel!r} of {name} is in the log too; {fix}")
             pieces.setdefault(channel, []).append((stamps, values, units))
     for channel, parts in pieces.items():
-        stamps_of_files, values_of_files, units = zip(*parts, strict=True)
-        conversions = [find_conversion(unit, units[0]) for unit in units]
+        stamps_of_files, values_of_files, file_units = zip(*parts, strict=True)
+        conversions = [find_conversion(unit, file_units[0]) for unit in file_units]
         if None in conversions:
             raise UnitError(
                 f"channel {channel!r} has different units in {list_some(files)}: "
-                f"{list_some(sorted(set(units)))}; {_ADVICE.format(channel)}"
+                f"{list_some(sorted(set(file_units)))}; {_ADVICE.format(channel)}"
             )
         numbers = [
             array * conversion[0] + conversion[1] if conversion else array
@@ -328,14 +328,12 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
         stamps, values = np.concatenate(stamps_of_files), np.concatenate(numbers)
         order, dim = np.argsort(stamps, kind="stable"), f"time_{channel}"
         log = log.assign_coords({dim: (dim, stamps[order])}).assign(
-            {channel: (dim, values[order], {"units": units[0]})}
+            {channel: (dim, values[order], {"units": file_units[0]})}
         )
     return log
 
 
-def _read_channels(
-    source: xr.Dataset, name: str
-) -> list[tuple[str, NDArray[Any], NDArray[Any], str]]:
+def _read_channels(source: xr.Dataset, name: str) -> list[tuple[str, Array, Array, str]]:
     channels = []
     for channel, variable in source.data_vars.items():
         dim = f"time_{channel}" if f"time_{channel}" in source.variables else "time"
@@ -439,7 +437,7 @@ def _drop_rows(part: xr.Dataset, rows: slice, other: xr.Dataset) -> tuple[xr.Dat
     return shorter, other.assign_attrs(notes=[*other.attrs["notes"], note])
 
 
-def _stamp_blocks(part: xr.Dataset) -> Iterator[tuple[int, NDArray[np.int64]]]:
+def _stamp_blocks(part: xr.Dataset) -> Iterator[tuple[int, Ints]]:
     """Yield the stamps of a raw log [ns since 1970] in blocks, with the first row of each."""
     for begin in range(0, part.sizes["row"], _BLOCK_ROWS):
         yield begin, read_stamps(part, begin, begin + _BLOCK_ROWS)
@@ -484,7 +482,7 @@ def _is_copy(held: xr.Dataset, part: xr.Dataset, signal: str, tail: int, head: i
 
 def _read_common(
     parts: tuple[xr.Dataset, xr.Dataset], signal: str, spans: Sequence[tuple[int, int]]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Read the signal (axis, row) of two files on their common axes at their common stamps."""
     ours, theirs = (read_stamps(part, *span) for part, span in zip(parts, spans, strict=True))
     stamps, *rows = np.intersect1d(ours, theirs, return_indices=True)

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Ints
 from gyrostab.errors import SchemaError
 from gyrostab.schema import GAP_CAUSES
 from gyrostab.time.grid import grid_index, grid_times
@@ -94,18 +94,18 @@ def describe_clock_change(jump: float) -> str:
     )
 
 
-def sort_gaps(table: NDArray[np.int64]) -> NDArray[np.int64]:
+def sort_gaps(table: Ints) -> Ints:
     """Sort a table by sample; merge nearest neighbours of one cause in one that is too long."""
     table = sort_lines(table)
     return sort_lines(_merge_neighbours(table)) if len(table) > _MAX_TABLE_ROWS else table
 
 
-def sort_lines(table: NDArray[np.int64]) -> NDArray[np.int64]:
+def sort_lines(table: Ints) -> Ints:
     """Sort a table by sample, and the lines of a sample by cause."""
     return np.asarray(table[np.lexsort((table[:, CAUSE], table[:, FIRST]))])
 
 
-def _merge_neighbours(table: NDArray[np.int64]) -> NDArray[np.int64]:
+def _merge_neighbours(table: Ints) -> Ints:
     """Merge lines of a sorted table."""
     parts = []
     for cause in np.unique(table[:, CAUSE]):
@@ -123,7 +123,7 @@ def _merge_neighbours(table: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.concatenate(parts)
 
 
-def clip_table(table: NDArray[np.int64], low: int, high: int) -> NDArray[np.int64]:
+def clip_table(table: Ints, low: int, high: int) -> Ints:
     """Cut a table of gaps to the lines, or parts of lines, from sample `low` to `high`.
 
     Examples
@@ -144,9 +144,7 @@ def clip_table(table: NDArray[np.int64], low: int, high: int) -> NDArray[np.int6
     return out
 
 
-def name_lost(
-    table: NDArray[np.int64], spans: Iterable[Iterable[int]], start: int, rate: float
-) -> NDArray[np.int64]:
+def name_lost(table: Ints, spans: Iterable[Iterable[int]], start: int, rate: float) -> Ints:
     """Change the cause of gaps that lost files leave to "unreadable".
 
     `spans` are first and last instant of each lost file [ns since 1970].
@@ -165,7 +163,7 @@ def name_lost(
     return table
 
 
-def gap_variables(table: NDArray[np.int64], start: int, rate: float) -> dict[str, Any]:
+def gap_variables(table: Ints, start: int, rate: float) -> dict[str, Any]:
     """Return the variables of a table of gaps; `start` [ns since 1970], `rate` [Hz]."""
     flags = {
         "flag_values": np.arange(len(GAP_CAUSES), dtype=np.int8),
@@ -187,7 +185,7 @@ def gap_variables(table: NDArray[np.int64], start: int, rate: float) -> dict[str
     }
 
 
-def read_gaps(log: xr.Dataset, start: int, rate: float) -> NDArray[np.int64] | None:
+def read_gaps(log: xr.Dataset, start: int, rate: float) -> Ints | None:
     """Read the table of gaps in grid samples (`COLUMNS`); None if it is inconsistent."""
     columns = read_gap_columns(log)
     if columns is None:
@@ -202,9 +200,9 @@ def read_gaps(log: xr.Dataset, start: int, rate: float) -> NDArray[np.int64] | N
     )
 
 
-def read_gap_columns(log: xr.Dataset) -> list[NDArray[np.int64]] | None:
+def read_gap_columns(log: xr.Dataset) -> list[Ints] | None:
     """Return stamps of both ends [ns since 1970], samples, rows, cause; None if inconsistent."""
-    columns: list[NDArray[np.int64]] = []
+    columns: list[Ints] = []
     for name, kind in (
         ("gap_start", "M"),
         ("gap_end", "M"),

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.errors import FormatError, GyrostabError
 from gyrostab.ingest.columns.dates import DAY_FIRST, EITHER_FIRST, MONTH_FIRST
 from gyrostab.ingest.columns.plan_time import UNREADABLE
@@ -168,13 +168,13 @@ def _row_rate(log: xr.Dataset, dim: str) -> float:
     return 1.0 / pace if pace > 0 else math.nan
 
 
-def _mean_steps(values: NDArray[np.float64]) -> list[float]:
+def _mean_steps(values: Floats) -> list[float]:
     """Return the mean steps of several blocks; their median ignores restarts, gaps, bursts."""
     blocks = np.array_split(values, min(MEAN_STEP_BLOCKS, max(1, values.size // 8)))
     return [float((block[-1] - block[0]) / (block.size - 1)) for block in blocks if block.size > 1]
 
 
-def _value_chunks(variable: xr.DataArray) -> Iterator[NDArray[np.float64]]:
+def _value_chunks(variable: xr.DataArray) -> Iterator[Floats]:
     dim = str(variable.dims[0])
     for start in range(0, variable.size, CHUNK_ROWS):
         values = np.asarray(

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.io.datasets import CHUNK_VALUES
 from gyrostab.store.lazy import Source, make_dask
 from gyrostab.store.output import replace_file
@@ -133,7 +133,7 @@ def assemble(blocks: Sequence[Block]) -> xr.Dataset:
     return dataset.set_coords(first["coords"])
 
 
-def _map_variable(block: Block, name: str) -> NDArray[Any]:
+def _map_variable(block: Block, name: str) -> Array:
     """Map a variable of a block file, for a copy: Windows does not remove a file that is mapped."""
     described = block.header["variables"][name]
     dtype, shape = np.dtype(described["dtype"]), tuple(described["shape"])
@@ -166,7 +166,7 @@ class _BlockSource(Source):
         shape = described["shape"]
         self.shape = (*shape[: self.along], int(self.edges[-1]), *shape[self.along + 1 :])
 
-    def __getitem__(self, box: Any) -> NDArray[Any]:
+    def __getitem__(self, box: Any) -> Array:
         begin, end = box[self.along].start, box[self.along].stop
         pieces = []
         for i in range(

@@ -15,17 +15,15 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.kernels.compiled import KERNEL
-
-Array = NDArray[np.float64]
 
 #: Smaller numbers are zero: the processor is slow with those that it cannot normalise.
 TINY = 1e-200
 
 
-def slab(slowest: float, count: int) -> tuple[Array, Array, Array]:
+def slab(slowest: float, count: int) -> tuple[Floats, Floats, Floats]:
     """Compute the modes of a winding that is heated from outside.
 
     Parameters
@@ -50,10 +48,10 @@ def slab(slowest: float, count: int) -> tuple[Array, Array, Array]:
     >>> times.round(1), whole.round(3), halves.round(3)
     (array([265. ,  29.4,  10.6]), array([0.811, 0.09 , 0.099]), array([-0.671,  0.435,  0.237]))
     """
-    odd: Array = np.arange(1, 2 * count, 2, dtype=np.float64)
+    odd: Floats = np.arange(1, 2 * count, 2, dtype=np.float64)
     root = odd * (math.pi / 2.0)
     sign = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)
-    whole: Array = np.asarray(2.0 / root**2, dtype=np.float64)
+    whole: Floats = np.asarray(2.0 / root**2, dtype=np.float64)
     halves = 4.0 * sign * (sign - 2.0 * np.sin(root / 2.0)) / root**2
     whole[-1] += 1.0 - whole.sum()
     halves[-1] -= halves.sum()
@@ -63,8 +61,8 @@ def slab(slowest: float, count: int) -> tuple[Array, Array, Array]:
 
 @njit(**KERNEL)
 def _relax_mode(
-    change: Array, decay: Array, gain: Array, weight: Array, carry: Array
-) -> tuple[Array, Array]:
+    change: Floats, decay: Floats, gain: Floats, weight: Floats, carry: Floats
+) -> tuple[Floats, Floats]:
     size, count = change.size, decay.size
     total = np.empty((weight.shape[0], size))
     position = carry.copy()
@@ -81,8 +79,8 @@ def _relax_mode(
 
 
 def relax(
-    values: Array, rate: float, times: Array, weight: Array, carry: tuple[float, Array]
-) -> tuple[Array, tuple[float, Array]]:
+    values: Floats, rate: float, times: Floats, weight: Floats, carry: tuple[float, Floats]
+) -> tuple[Floats, tuple[float, Floats]]:
     """Differentiate samples with the delay of every mode: ``v' = (T' - v) / t``, T straight.
 
     Parameters
@@ -113,8 +111,8 @@ def relax(
 
 
 def lag_values(
-    values: Array, rate: float, time: float, carry: tuple[float, Array] | None = None
-) -> tuple[Array, tuple[float, Array]]:
+    values: Floats, rate: float, time: float, carry: tuple[float, Floats] | None = None
+) -> tuple[Floats, tuple[float, Floats]]:
     """Apply a first-order lag [s] to samples at `rate` [Hz], linear between them.
 
     `carry` is what the call for the samples before returned; without it, from equilibrium.
@@ -125,7 +123,7 @@ def lag_values(
 
 
 @njit(**KERNEL)
-def _follow_values(at: Array, values: Array, time: float) -> Array:
+def _follow_values(at: Floats, values: Floats, time: float) -> Floats:
     behind = 0.0
     out = np.empty(at.size)
     out[0] = values[0]
@@ -139,7 +137,9 @@ def _follow_values(at: Array, values: Array, time: float) -> Array:
     return out
 
 
-def mean_changes(value_times: Array, values: Array, begin: Array, end: Array, time: float) -> Array:
+def mean_changes(
+    value_times: Floats, values: Floats, begin: Floats, end: Floats, time: float
+) -> Floats:
     """Average one mode of `relax` over intervals, with T straight between few values.
 
     Parameters
@@ -168,8 +168,8 @@ def mean_changes(value_times: Array, values: Array, begin: Array, end: Array, ti
 
 
 def mean_followed(
-    value_times: Array, values: Array, begin: Array, end: Array, time: float
-) -> Array:
+    value_times: Floats, values: Floats, begin: Floats, end: Floats, time: float
+) -> Floats:
     """Average what follows T with one relaxation time, ``y' = (T - y) / t``, as `mean_changes`.
 
     Examples
@@ -186,8 +186,8 @@ def mean_followed(
 
 
 def _polygon_corners(
-    value_times: Array, values: Array, begin: Array, end: Array
-) -> tuple[Array, Array]:
+    value_times: Floats, values: Floats, begin: Floats, end: Floats
+) -> tuple[Floats, Floats]:
     """Find the corners of the polygon through the known values, and at the edges of intervals."""
     at = np.unique(np.concatenate([value_times, begin, end]))
     line = np.interp(at, value_times, values)
@@ -198,20 +198,20 @@ def _polygon_corners(
     return at, line
 
 
-def _average_growth(at: Array, values: Array, begin: Array, end: Array) -> Array:
+def _average_growth(at: Floats, values: Floats, begin: Floats, end: Floats) -> Floats:
     """Average the slope of a curve over intervals, whose edges are among its corners."""
     return np.asarray(
         (values[np.searchsorted(at, end)] - values[np.searchsorted(at, begin)]) / (end - begin)
     )
 
 
-def _integrate_steps(at: Array, means: Array) -> Array:
+def _integrate_steps(at: Floats, means: Floats) -> Floats:
     """Integrate a curve from its first corner to each, from its means between corners."""
     return np.concatenate([[0.0], np.cumsum(means * np.diff(at))])
 
 
 @njit(**KERNEL)
-def apply_dead_band(values: Array, width: float, start: float) -> tuple[Array, float]:
+def apply_dead_band(values: Floats, width: float, start: float) -> tuple[Floats, float]:
     """Apply a dead band of half-width `width`: the output moves only when `values` pushes it.
 
     Parameters
@@ -241,8 +241,8 @@ def apply_dead_band(values: Array, width: float, start: float) -> tuple[Array, f
 
 
 def mean_dead_band_distance(
-    value_times: Array, values: Array, begin: Array, end: Array, width: float
-) -> Array:
+    value_times: Floats, values: Floats, begin: Floats, end: Floats, width: float
+) -> Floats:
     """Average the distance of T from the output of `apply_dead_band`, as `mean_changes`.
 
     `width` is the half-width of the dead band, whose output begins at T at the first time.

@@ -6,7 +6,8 @@ import math
 import threading
 
 import numpy as np
-from numpy.typing import NDArray
+
+from gyrostab.arrays import Floats
 
 # Bytes of a line of the cache; vectors that begin with one are loaded at once.
 _LINE = 64
@@ -24,9 +25,9 @@ class Workspace:
     """
 
     def __init__(self) -> None:
-        self._kept: dict[str, NDArray[np.float64]] = {}
+        self._kept: dict[str, Floats] = {}
 
-    def array(self, name: str, *shape: int) -> NDArray[np.float64]:
+    def array(self, name: str, *shape: int) -> Floats:
         """Return an uninitialised array that begins at a cache line."""
         size = math.prod(shape)
         if name not in self._kept or self._kept[name].size < size:

@@ -9,9 +9,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
+from gyrostab.arrays import Array, Floats, Ints
+from gyrostab.physics.base import Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.units import DAY, HOUR
 
 
@@ -50,13 +50,13 @@ class AgeingBias(Effect):
         "h", "time after which the logarithm bends", default=24.0, low=1e-3, high=1e6
     )
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         middle = chunk.seconds + 0.5 / chunk.rate
         return self.slope * (middle / DAY) + self.logarithmic * np.log1p(
             middle / (self.time * HOUR)
         ), state
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         """List times at which the logarithm bends, 0.03 to 3 times the length of the record."""
         length = (windows.end[-1] - windows.begin[0]) / HOUR
         return {"time": np.maximum(length * np.array([0.03, 0.1, 0.3, 1.0, 3.0]), 1e-3)}
@@ -65,7 +65,7 @@ class AgeingBias(Effect):
         """Predict the window means of both parts."""
         scale = self.time * HOUR
 
-        def integral(t: Array) -> Array:
+        def integral(t: Floats) -> Floats:
             return np.asarray((scale + t) * np.log1p(t / scale) - t)
 
         bend = (integral(windows.end) - integral(windows.begin)) / (windows.end - windows.begin)
@@ -111,12 +111,12 @@ class AgeingNoise(Effect):
     )
     exponent: float = parameter("1", "power of time", default=1.0, low=0.1, high=5.0)
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Floats], Any]:
         hours = (chunk.seconds + 0.5 / chunk.rate) / HOUR
         base = chunk.setup.noise["N"][:, None] ** 2
         return {"N": chunk.level["N"] + base * (self.growth * hours**self.exponent)}, state
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         return {"exponent": np.array([0.5, 1.0, 2.0])}
 
     def explain(self, windows: Windows) -> Prediction:
@@ -195,12 +195,12 @@ class WarmUp(Effect):
             self.slow_time,
         )
 
-    def _list_losses(self, gaps: NDArray[Any], restarts: NDArray[Any], per_second: float) -> Array:
+    def _list_losses(self, gaps: Array, restarts: Array, per_second: float) -> Floats:
         """List losses of power [s] from gaps and restarts in units of 1 / `per_second` s."""
         long = (gaps[:, 1] - gaps[:, 0]) >= self.gap * per_second * (1.0 - 1e-9)
         return _merge_spans(np.concatenate([restarts, gaps[long]])) / per_second
 
-    def _initial_shares(self, losses: Array, time: float) -> Array:
+    def _initial_shares(self, losses: Floats, time: float) -> Floats:
         """Compute the share of the amplitude at the start and after every loss of power."""
         on, share, shares = 0.0, self.cold, [self.cold]
         for gone, back in losses.tolist():
@@ -219,7 +219,7 @@ class WarmUp(Effect):
             self._initial_shares(losses, time) for _, _, time in self._list_parts()
         ]
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         on, shares = state
         which = (
             np.searchsorted(
@@ -238,7 +238,7 @@ class WarmUp(Effect):
             )
         return bias, state
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         """List time constants of the gyro and of its cooling."""
         slow = {"slow_time": np.geomspace(1800.0, 14400.0, 4)} if self.slow_amplitude else {}
         return {
@@ -279,7 +279,7 @@ class WarmUp(Effect):
         return f"The bias starts {size} off {self.on_axes()} after every power-on and {settles}."
 
 
-def _merge_spans(spans: NDArray[Any]) -> Array:
+def _merge_spans(spans: Array) -> Floats:
     """Sort spans, and merge those that touch."""
     rows: list[list[float]] = []
     for begin, end in sorted(spans.tolist()):
@@ -291,8 +291,8 @@ def _merge_spans(spans: NDArray[Any]) -> Array:
 
 
 def _integrate_decay(
-    row: NDArray[np.int64], t: Array, *, time: float, size: Array, since: Array, begin: Array
-) -> Array:
+    row: Ints, t: Floats, *, time: float, size: Floats, since: Floats, begin: Floats
+) -> Floats:
     """Integrate an exponential from the begin of a span, `since` after its power-on, to t."""
     return np.asarray(
         time * size[row] * np.exp(-since[row] / time) * -np.expm1(-(t - begin[row]) / time)
@@ -300,13 +300,13 @@ def _integrate_decay(
 
 
 def _integrate_windows(
-    windows: Windows, begin: Array, end: Array, part: Callable[[NDArray[np.int64], Array], Array]
-) -> Array:
+    windows: Windows, begin: Floats, end: Floats, part: Callable[[Ints, Floats], Floats]
+) -> Floats:
     """Integrate over every window; ``part(row, t)`` is the integral from begin[row] to t."""
     until = np.maximum(np.minimum(end, windows.end.max()), begin)
     integral_before = np.concatenate([[0.0], np.cumsum(part(np.arange(begin.size), until))])
 
-    def up_to(t: Array) -> Array:
+    def up_to(t: Floats) -> Floats:
         row = np.searchsorted(begin, t, side="right") - 1
         return np.asarray(integral_before[row] + part(row, np.minimum(t, end[row])))
 

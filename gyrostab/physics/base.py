@@ -15,15 +15,14 @@ from functools import cache
 from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.physics.prediction import Array, Prediction, Windows
+from gyrostab.physics.prediction import Prediction, Windows
 from gyrostab.wording import format_value, join_words
 
 __all__ = [
     "STAGES",
-    "Array",
     "Chunk",
     "Effect",
     "Likeness",
@@ -124,12 +123,12 @@ class Setup:
     size: int  # samples of the whole log at that rate
     axes: tuple[str, ...]  # the effect's axes, in the order of the rows of every array
     #: (axes,): noise coefficients of the model by symbol [unit of the law]: Q, N, B, K, R.
-    noise: Mapping[str, Array] = field(default_factory=dict)
+    noise: Mapping[str, Floats] = field(default_factory=dict)
     #: (n, 2): all gaps of the log, [first missing sample, first sample after].
-    gaps: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    gaps: Ints = field(default_factory=lambda: np.empty((0, 2), np.int64))
     #: (n, 2): all losses of power, [sample of the loss, sample of the return]; the start of the log
     #: is not among them.
-    restarts: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    restarts: Ints = field(default_factory=lambda: np.empty((0, 2), np.int64))
     #: Samples of the instrument in one sampling interval of the log; `rate` is higher by this
     #: factor before the stage "logger".
     oversampling: int = 1
@@ -147,18 +146,18 @@ class Chunk:
     size: int  # number of samples
     #: (size,): channels that the effect needs, by the names of `Effect.channels`, without NaN, in
     #: the units given there.
-    drivers: Mapping[str, Array] = field(default_factory=dict)
+    drivers: Mapping[str, Floats] = field(default_factory=dict)
     #: (size,): true rotation rate of every axis of the log [degree hour-1], including axes that the
     #: effect does not act on; complete after "motion".
-    true: Mapping[str, Array] = field(default_factory=dict)
+    true: Mapping[str, Floats] = field(default_factory=dict)
     #: (size,): recorded rate of the axes of `Effect.recorded_axes` [degree hour-1], without NaN.
-    recorded: Mapping[str, Array] = field(default_factory=dict)
+    recorded: Mapping[str, Floats] = field(default_factory=dict)
     #: (axes, size): signal before the effect [degree hour-1]; for the stages "sensor" and later.
-    signal: Array = field(default_factory=lambda: np.empty((0, 0)))
+    signal: Floats = field(default_factory=lambda: np.empty((0, 0)))
     #: (axes, size): Q and N in the signal, as they were added; for the stage "sampling".
-    white: Array = field(default_factory=lambda: np.zeros((1, 1)))
+    white: Floats = field(default_factory=lambda: np.zeros((1, 1)))
     #: (axes, size): squared noise coefficients by symbol before the effect; for the stage "noise".
-    level: Mapping[str, Array] = field(default_factory=dict)
+    level: Mapping[str, Floats] = field(default_factory=dict)
 
     @property
     def rate(self) -> float:
@@ -166,7 +165,7 @@ class Chunk:
         return self.setup.rate
 
     @property
-    def seconds(self) -> Array:
+    def seconds(self) -> Floats:
         """Time of every sample since the start of the log [s]."""
         return (self.first + np.arange(self.size)) / self.setup.rate
 
@@ -283,7 +282,7 @@ class Effect:
         """Map each channel of `channels` to its name in the log."""
         return dict(zip(self.channels, self.driver or self.channels, strict=True))
 
-    def expand_to_axes(self, name: str, axes: tuple[str, ...]) -> Array:
+    def expand_to_axes(self, name: str, axes: tuple[str, ...]) -> Floats:
         """Expand a parameter to one number per axis; one number applies to all, none means zeros.
 
         Raises
@@ -324,11 +323,11 @@ class Effect:
         """
         raise NotImplementedError
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         """Map each nonlinear parameter to the values to try on these data."""
         return {}
 
-    def transfer(self, rate: Array) -> Array | None:
+    def transfer(self, rate: Floats) -> Floats | None:
         """Return the output at each rate; None if the effect does more than change single samples.
 
         Only for effects that reduce the scatter of noise.

@@ -9,8 +9,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from gyrostab.arrays import Floats
 from gyrostab.errors import OptionError
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
+from gyrostab.physics.base import Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.physics.phase import (
     TURN,
     fold,
@@ -95,7 +96,7 @@ class EarthRate(Effect):
         high = north * math.cos(inc) * math.cos(azi) - down * math.sin(inc)
         return along, high, -north * math.sin(azi)
 
-    def directions(self, axes: tuple[str, ...]) -> tuple[Array, Array]:
+    def directions(self, axes: tuple[str, ...]) -> tuple[Floats, Floats]:
         """Compute the angles of the axes from the tool's axis and around it [radian]."""
         if self.off or self.around:  # across the tool by default
             off = self.expand_to_axes("off", axes) if self.off else np.full(len(axes), 90.0)
@@ -115,20 +116,20 @@ class EarthRate(Effect):
         self.directions(setup.axes)
         return 0.0
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         middle, inside, state = turns_of_samples(chunk.drivers["rotation_rate"], chunk.rate, state)
         along, across, phase = self._rates_on(chunk.setup.axes)
         means = turn_means(middle, inside, phase[:, None])
         return np.asarray(along[:, None] + across[:, None] * means), state
 
-    def _rates_on(self, axes: tuple[str, ...]) -> tuple[Array, Array, Array]:
+    def _rates_on(self, axes: tuple[str, ...]) -> tuple[Floats, Floats, Floats]:
         """Return the constant rate of each axis, and amplitude and phase of the one that turns."""
         along, high, right = self.components()
         off, around = self.directions(axes)
         phase = math.radians(self.toolface) + around - math.atan2(right, high)
         return along * np.cos(off), math.hypot(high, right) * np.sin(off), phase
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         """List initial toolfaces; a survey knows the other parameters."""
         return {"toolface": np.arange(0.0, 360.0, 30.0)}
 

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from gyrostab.arrays import Floats
 from gyrostab.physics.base import (
-    Array,
     Chunk,
     Effect,
     Likeness,
@@ -85,7 +85,7 @@ class SupplyBias(Effect):
     def begin(self, setup: Setup, rng: np.random.Generator) -> Any:
         return {}
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         bias = np.zeros(chunk.size)
         if not chunk.size:
             return bias, state
@@ -128,7 +128,7 @@ class SupplyBias(Effect):
         place, spectrum = steady_line(windows, self.frequency)
         return Prediction(mean=mean, spectrum={"ripple": spectrum}, coherent=True, line=place)
 
-    def _average_channel(self, windows: Windows, name: str) -> Array:
+    def _average_channel(self, windows: Windows, name: str) -> Floats:
         from gyrostab.kernels.thermal import mean_followed
 
         if not self.lag:
@@ -183,7 +183,7 @@ class GaussMarkov(Effect):
         """Make the random generator and the initial value of every axis."""
         return [(child, float(child.standard_normal())) for child in rng.spawn(len(setup.axes))]
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         from gyrostab.kernels.random.stochastic import ornstein_uhlenbeck_means
 
         unit, new_state = np.empty(chunk.shape), []
@@ -195,7 +195,7 @@ class GaussMarkov(Effect):
             new_state.append((child, position))
         return self.expand_to_axes("rms", chunk.setup.axes)[:, None] * unit, new_state
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         """List correlation times from ten samples to a quarter of the record."""
         return {
             "correlation_time": np.geomspace(
@@ -247,10 +247,10 @@ class Clipping(Effect):
     )
     centre: float = parameter("deg/h", "middle of the range", default=0.0, limit=1e12)
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         return self.transfer(chunk.signal), state
 
-    def transfer(self, rate: Array) -> Array:
+    def transfer(self, rate: Floats) -> Floats:
         """Return the clipped rates."""
         if self.limit == 0.0:
             return rate

@@ -9,8 +9,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from gyrostab.arrays import Floats
 from gyrostab.errors import OptionError
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
+from gyrostab.physics.base import Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.physics.phase import fold, line_density
 from gyrostab.units import HOUR, INNER
 
@@ -126,7 +127,7 @@ class FeedbackReset(Effect):
         rows = 1 if self.phase == "channel" else len(setup.axes)
         return np.zeros(rows), None, np.zeros((rows, 1))
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         turns, reading, tail = state
         if self.phase == "channel":
             ramp = chunk.drivers["ramp"] / self.full
@@ -147,8 +148,8 @@ class FeedbackReset(Effect):
         return chunk.signal + error, (edges[:, -1].copy(), reading, tail)
 
     def _average_tail(
-        self, resets: Array, ages: Array, tail: Array, rate: float
-    ) -> tuple[Array, Array]:
+        self, resets: Floats, ages: Floats, tail: Floats, rate: float
+    ) -> tuple[Floats, Floats]:
         """Average the tails over samples; return also the rest at the end.
 
         `ages` sums exp(-age / decay) over the resets in a sample.
@@ -164,7 +165,7 @@ class FeedbackReset(Effect):
             resets - ages
         ), tail_at_end[:, -1:].copy()
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         """List decay times from the sampling interval to half a turn, and diameters.
 
         Diameters follow from a recorded ramp, and so does a turn; without one, decays have at most
@@ -173,7 +174,7 @@ class FeedbackReset(Effect):
         turns = float(np.nanmean(windows.turns)) if np.isfinite(windows.turns).any() else 0.0
         longest = 0.5 / abs(turns) if turns else 0.0
         count = max(math.floor(math.log2(max(2.0 * longest * windows.rate, 1.0))) + 1, 5)
-        decay: Array = np.ldexp(0.5, np.arange(count)) / windows.rate
+        decay: Floats = np.ldexp(0.5, np.arange(count)) / windows.rate
         rates = np.array(
             [
                 np.nanmean(windows.own[axis])
@@ -216,7 +217,7 @@ class FeedbackReset(Effect):
             phase_locked=self._predict_profiles(windows),
         )
 
-    def _predict_profiles(self, windows: Windows) -> dict[str, Array]:
+    def _predict_profiles(self, windows: Windows) -> dict[str, Floats]:
         """Predict the error by phase of the ramp at the end of the sample, averaged over the bins.
 
         The turns of the ramp in a sample are taken as constant.
@@ -232,7 +233,7 @@ class FeedbackReset(Effect):
         end = turns if direction > 0.0 else 1.0 - turns  # turns since the last reset
         begin, decay = end - step, step * self.decay * windows.rate
 
-        def lost_slowly(at: Array) -> Array:
+        def lost_slowly(at: Floats) -> Floats:
             whole_turns = np.floor(at)
             return np.asarray(
                 whole_turns + np.expm1((whole_turns - at) / decay) / np.expm1(-1.0 / decay)
@@ -260,7 +261,7 @@ class FeedbackReset(Effect):
         return f"Every reset of the ramp leaves {size} {self.on_axes()}{also}, {turn}."
 
 
-def _sawtooth_means(edges: Array) -> Array:
+def _sawtooth_means(edges: Floats) -> Floats:
     """Average ``1 - 2 phase`` between successive turns of the ramp."""
     phase = edges - np.floor(edges)
     area = phase * (1.0 - phase)
@@ -271,7 +272,7 @@ def _sawtooth_means(edges: Array) -> Array:
     )
 
 
-def _count_resets(edges: Array, samples: float) -> tuple[Array, Array]:
+def _count_resets(edges: Floats, samples: float) -> tuple[Floats, Floats]:
     """Count the signed resets in every sample, and sum exp(-age / samples) at its end."""
     whole_turns = np.floor(edges)
     resets = np.diff(whole_turns, axis=1)

@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from gyrostab.arrays import Floats
 from gyrostab.physics.base import (
-    Array,
     Chunk,
     Effect,
     Likeness,
@@ -26,7 +26,7 @@ _LIGHT_M_PER_S = 299_792_458.0  # m/s
 _RADIAN_PER_S = math.degrees(1.0) * HOUR  # deg/h
 
 
-def step_means(positions: Sequence[float], levels: Sequence[Any], first: int, size: int) -> Array:
+def step_means(positions: Sequence[float], levels: Sequence[Any], first: int, size: int) -> Floats:
     """Average a piecewise constant function over each sample.
 
     Parameters
@@ -67,7 +67,7 @@ class _Stepping:
     next: float
 
 
-def _average_process(process: _Stepping, chunk: Chunk, step: Callable[[_Stepping], None]) -> Array:
+def _average_process(process: _Stepping, chunk: Chunk, step: Callable[[_Stepping], None]) -> Floats:
     """Average a process over each sample; `step` changes its level and sets its next step."""
     positions: list[float] = []
     levels = [process.level]
@@ -84,7 +84,7 @@ def _draw_wait(rng: np.random.Generator, mean: float) -> float:
     return math.inf if math.isinf(mean) else drawn * mean
 
 
-def _share_after(windows: Windows, instant: float) -> Array:
+def _share_after(windows: Windows, instant: float) -> Floats:
     """Compute the share of every window that lies after an instant [s]."""
     return np.clip((windows.end - instant) / (windows.end - windows.begin), 0.0, 1.0)
 
@@ -152,7 +152,7 @@ class BiasJump(Effect):
             mean,
         )
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         places, levels, process, mean = state
 
         def jump(process: _Stepping) -> None:
@@ -164,7 +164,7 @@ class BiasJump(Effect):
         listed_jumps = step_means(places, levels, chunk.first, chunk.size)
         return listed_jumps + _average_process(process, chunk, jump), state
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         """List times of the jump: returns of power, and edges and centres of the windows."""
         restart_times = windows.restarts[:, 1] if windows.restarts.size else np.empty(0)
         return {
@@ -243,7 +243,7 @@ class Telegraph(Effect):
             )
         return rows
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         def switch(process: _Stepping) -> None:
             process.level = 1.0 - process.level
             process.next += _draw_wait(
@@ -253,7 +253,7 @@ class Telegraph(Effect):
         unit = np.stack([_average_process(row, chunk, switch) for row in state])
         return self.expand_to_axes("step", chunk.setup.axes)[:, None] * unit, state
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         """List mean times at both levels, from ten samples to a quarter of the record."""
         times = np.geomspace(
             10.0 / windows.rate, max(windows.end[-1] / 4.0, 20.0 / windows.rate), 6
@@ -352,7 +352,7 @@ class FringeHop(Effect):
             return [_Stepping(child, 0.0, self.at * setup.rate) for child in children]
         return [_Stepping(child, 0.0, _draw_wait(child, mean)) for child in children]
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         mean = (
             HOUR * chunk.rate / self.per_hour if self.per_hour and math.isinf(self.at) else math.inf
         )
@@ -374,7 +374,7 @@ class FringeHop(Effect):
         fringes = np.stack([_average_process(row, chunk, switch) for row in state])
         return chunk.signal + self.order * self.fringe * fringes, state
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         """List times of the step: the edges of the windows."""
         return {"at": windows.begin[1:]}
 

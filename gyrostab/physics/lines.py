@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from gyrostab.arrays import Floats
 from gyrostab.physics.base import (
-    Array,
     Chunk,
     Effect,
     Likeness,
@@ -92,7 +92,7 @@ class SpectralLine(Effect):
 
         return begin_process(oscillator(self.frequency, self.quality, setup.rate), rng)
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         amplitude = self.expand_to_axes("amplitude", chunk.setup.axes)[:, None]
         if isinstance(state, np.ndarray):
             return amplitude * sine_means(chunk, self.frequency, state[:, None]), state
@@ -101,7 +101,7 @@ class SpectralLine(Effect):
         values, state = read_process(state, chunk.size)
         return amplitude / math.sqrt(2.0) * values, state
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         """List one frequency per band, and qualities of a resonance."""
         grid = {"frequency": windows.frequency}
         return grid if math.isinf(self.quality) else grid | {"quality": np.array([5.0, 15.0, 50.0])}
@@ -170,7 +170,7 @@ class RotationLine(Effect):
         """Start with zero turns of the channel."""
         return 0.0
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         rotation = chunk.drivers["rotation_rate"]
         middle, inside, state = turns_of_samples(self.order * rotation, chunk.rate, state)
         amplitude = self.expand_to_axes("amplitude", chunk.setup.axes)
@@ -181,7 +181,7 @@ class RotationLine(Effect):
         )
         return lines * (np.abs(rotation) >= _LEAST_TURNING_DEG_S), state
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         """List phases over half a turn (the amplitude is signed), and lines per turn."""
         return {"phase": np.arange(0.0, 180.0, 30.0), "order": np.array([1.0, 2.0, 3.0, 4.0])}
 

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
+from gyrostab.arrays import Floats
+from gyrostab.physics.base import Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.units import HOUR
 
 #: Mean lengths of a frame sent twice, to which its geometric law is cut: longer ones have a
@@ -50,7 +51,7 @@ class RateQuantization(Effect):
         choices=("round", "floor", "zero"),
     )
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         if self.step == 0.0:
             return chunk.signal, state
         count = chunk.signal / self.step
@@ -58,7 +59,7 @@ class RateQuantization(Effect):
             count
         ), state
 
-    def transfer(self, rate: Array) -> Array | None:
+    def transfer(self, rate: Floats) -> Floats | None:
         """Return the truncated values of "zero"; rounding adds noise instead."""
         is_truncated = self.mode == "zero" and self.step > 0.0
         return self.step * np.trunc(rate / self.step) if is_truncated else None
@@ -125,7 +126,7 @@ class Spikes(Effect):
             for child in rng.spawn(len(setup.axes))
         ]
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         signal, chance, new_state = chunk.signal.copy(), self._sample_probability(chunk.rate), []
         for row, (child, following) in enumerate(state):
             while following is not None and following < chunk.first + chunk.size:
@@ -225,7 +226,7 @@ class HeldSamples(Effect):
         longest = math.ceil(_FRAME_LENGTHS * max(1.0, self.length * rate))
         return longest if self.fill == "frame" else 1
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         rng, loss, memory = state
         n_kept = self._samples_kept(chunk.rate)
         if memory is None:

@@ -14,10 +14,10 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from gyrostab.arrays import Floats
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.base import (
-    Array,
     Chunk,
     Effect,
     Likeness,
@@ -39,7 +39,7 @@ _RESONANCE_QUALITIES = (1.0, 4.0)
 _MOUNT_BAND = 10.0
 
 
-def _raise_noise(effect: Effect, chunk: Chunk, share: Array) -> dict[str, Array]:
+def _raise_noise(effect: Effect, chunk: Chunk, share: Floats) -> dict[str, Floats]:
     """Raise squared N by a share of the model's value, at least to `LEAST_SHARE` of it."""
     if share.size and float(share.min()) < LEAST_SHARE - 1.0:
         driver = effect.channel_names()[next(iter(chunk.drivers))]
@@ -111,7 +111,7 @@ class TemperatureNoise(Effect):
             linear=self.linear + 2.0 * self.quadratic * (at - self.reference),
         )
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Floats], Any]:
         above = chunk.drivers["temperature"] - self.reference
         return _raise_noise(self, chunk, above * (self.linear + above * self.quadratic)), state
 
@@ -201,7 +201,7 @@ class LightPowerNoise(Effect):
         """List the light power, because the effect divides by it."""
         return self.needs()
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Floats], Any]:
         power = chunk.drivers["light_power"]
         if power.size and not float(power.min()) > 0.0:
             place = int(power.argmin())
@@ -239,11 +239,11 @@ class _FollowsVibration(Effect):
         "1", "power of the vibration with which the noise grows", default=1.0, low=0.1, high=4.0
     )
 
-    def _raise_to_power(self, drivers: Mapping[str, Array]) -> Array:
+    def _raise_to_power(self, drivers: Mapping[str, Floats]) -> Floats:
         """Compute the vibration [g] to the power of the added variance."""
         return np.asarray(np.abs(drivers["vibration"]) ** (2.0 * self.exponent))
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Floats], Any]:
         excited = self._raise_to_power(chunk.drivers)
         return {
             symbol: chunk.level[symbol] + getattr(self, name) ** 2 * excited
@@ -260,7 +260,7 @@ class _FollowsVibration(Effect):
             }
         )
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         return {"exponent": np.array([0.5, 1.0, 2.0])}
 
     def _describe_law(self, errors: Mapping[str, float] | None) -> str:
@@ -343,7 +343,7 @@ class VibrationNoise(_FollowsVibration):
         reading = mount(self.resonance, self.quality, setup.rate)
         return [begin_process(reading, own) for own in rng.spawn(len(setup.axes))]
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Array], Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Floats], Any]:
         if not self.resonance:
             return super().generate(chunk, state)
         from gyrostab.kernels.random.coloured import read_process
@@ -371,7 +371,7 @@ class VibrationNoise(_FollowsVibration):
             return super().explain(windows)
         from gyrostab.kernels.random.coloured import folded_psd, mount_psd
 
-        def density(f: Array) -> Array:
+        def density(f: Floats) -> Floats:
             return mount_psd(f, self.resonance, self.quality)
 
         highest = max(windows.rate, _MOUNT_BAND * self.resonance)

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from gyrostab.arrays import Floats
 from gyrostab.noise import sampled_psd
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
+from gyrostab.physics.base import Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.physics.phase import lorentz_density
 
 
@@ -55,7 +56,7 @@ class DeadZone(Effect):
         choices=("offset", "jump"),
     )
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         if self.width == 0.0:
             return chunk.signal, state
         slow = chunk.signal
@@ -68,14 +69,14 @@ class DeadZone(Effect):
             slow, state = lfilter([1.0 - keep], [1.0, -keep], chunk.signal, zi=state)
         return chunk.signal + self._zone_change(slow), state
 
-    def _zone_change(self, rate: Array) -> Array:
+    def _zone_change(self, rate: Floats) -> Floats:
         away = rate - self.centre
         inside = np.clip(away, -self.width, self.width)
         return (
             -inside if self.edge == "offset" else np.where(np.abs(away) < self.width, -inside, 0.0)
         )
 
-    def transfer(self, rate: Array) -> Array | None:
+    def transfer(self, rate: Floats) -> Floats | None:
         """Return the output at each rate, without a bandwidth."""
         return rate + self._zone_change(rate) if math.isinf(self.bandwidth) else None
 
@@ -131,7 +132,7 @@ class SharedSource(Effect):
         """Draw the initial value of the common noise."""
         return rng, (0.0 if math.isinf(self.bandwidth) else float(rng.standard_normal()))
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         rng, position = state
         if math.isinf(self.bandwidth):
             common = math.sqrt(chunk.rate) * rng.standard_normal(chunk.size)
@@ -148,7 +149,7 @@ class SharedSource(Effect):
     def _time_constant(self) -> float:
         return 1.0 / (2.0 * math.pi * self.bandwidth)
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         """List low-passes from the narrowest that the band resolves to its upper end, and none."""
         parts = np.array([80.0, 40.0, 20.0, 10.0, 5.0, 2.5, 1.5])
         return {"bandwidth": np.append(windows.rate / parts, math.inf)}

@@ -6,14 +6,15 @@ import math
 
 import numpy as np
 
+from gyrostab.arrays import Floats
 from gyrostab.kernels.spectra.expected import interval_variance
-from gyrostab.physics.base import Array, Chunk, Windows
+from gyrostab.physics.base import Chunk, Windows
 
 #: Degrees in a turn.
 TURN = 360.0
 
 
-def fold(frequency: Array | float, rate: float) -> Array:
+def fold(frequency: Floats | float, rate: float) -> Floats:
     """Compute the aliased frequency of a line in samples at `rate` [Hz], from 0 to half of it.
 
     Examples
@@ -24,7 +25,7 @@ def fold(frequency: Array | float, rate: float) -> Array:
     return np.abs(frequency - rate * np.round(np.asarray(frequency, np.float64) / rate))
 
 
-def turns_of_samples(rotation: Array, rate: float, carry: float) -> tuple[Array, Array, float]:
+def turns_of_samples(rotation: Floats, rate: float, carry: float) -> tuple[Floats, Floats, float]:
     """Compute the turns at the middle of every sample, within it, and at the end of the last.
 
     The rotation rate is constant within a sample.
@@ -48,12 +49,12 @@ def turns_of_samples(rotation: Array, rate: float, carry: float) -> tuple[Array,
     return edges[:-1] + inside / 2.0, inside, float(edges[-1])
 
 
-def turn_means(middle: Array, inside: Array, phase: Array | float = 0.0) -> Array:
+def turn_means(middle: Floats, inside: Floats, phase: Floats | float = 0.0) -> Floats:
     """Average ``cos(2 pi turns + phase)`` over intervals of constant rotation (`phase` in rad)."""
     return np.asarray(np.sinc(inside) * np.cos(2.0 * math.pi * np.remainder(middle, 1.0) + phase))
 
 
-def sine_means(chunk: Chunk, frequency: float, phase: Array | float = 0.0) -> Array:
+def sine_means(chunk: Chunk, frequency: float, phase: Floats | float = 0.0) -> Floats:
     """Average ``sin(2 pi f t + phase)`` over every sample (`frequency` in Hz, `phase` in rad)."""
     cycles = frequency / chunk.rate
     middle = (np.arange(chunk.first, chunk.first + chunk.size, dtype=np.float64) + 0.5) * cycles
@@ -61,8 +62,8 @@ def sine_means(chunk: Chunk, frequency: float, phase: Array | float = 0.0) -> Ar
 
 
 def turn_means_of_windows(
-    windows: Windows, rotation: Array, phase: Array, *, order: float = 1.0
-) -> Array:
+    windows: Windows, rotation: Floats, phase: Floats, *, order: float = 1.0
+) -> Floats:
     """Average ``cos(2 pi order turns + phase)`` over windows, as measured where that is known.
 
     Otherwise the rotation is taken as even within a window, which it is not in stick-slip.
@@ -89,7 +90,7 @@ def turn_means_of_windows(
     return means
 
 
-def line_density(windows: Windows, frequency: Array | float, power: Array | float) -> Array:
+def line_density(windows: Windows, frequency: Floats | float, power: Floats | float) -> Floats:
     """Compute the two-sided density [unit of `power` Hz-1] that a line adds to its band.
 
     The bands meet halfway in log frequency.
@@ -125,13 +126,13 @@ def line_density(windows: Windows, frequency: Array | float, power: Array | floa
     return density / (2.0 * np.diff(edges))
 
 
-def steady_line(windows: Windows, frequency: float) -> tuple[Array, Array]:
+def steady_line(windows: Windows, frequency: float) -> tuple[Floats, Floats]:
     """Compute aliased frequency [Hz] and density of a sinusoid of unit amplitude in the windows."""
     place = np.full(windows.begin.size, float(fold(frequency, windows.rate)))
     return place, line_density(windows, place, 0.5 * np.sinc(frequency / windows.rate) ** 2)
 
 
-def resonance_density(windows: Windows, frequency: float, quality: float) -> Array:
+def resonance_density(windows: Windows, frequency: float, quality: float) -> Floats:
     """Compute the two-sided density [Hz-1] of a resonance of unit mean square in the samples.
 
     It is the same in all windows, shape (window, band).
@@ -149,7 +150,7 @@ def resonance_density(windows: Windows, frequency: float, quality: float) -> Arr
     return np.broadcast_to(folded, (windows.begin.size, folded.size))
 
 
-def lorentz_density(frequency: Array, correlation_time: float, rate: float) -> Array:
+def lorentz_density(frequency: Floats, correlation_time: float, rate: float) -> Floats:
     """Compute the aliased two-sided density [Hz-1] of a unit exponentially correlated process.
 
     A sample is the mean over its interval. With x the interval over the correlation time, the

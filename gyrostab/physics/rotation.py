@@ -9,8 +9,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from gyrostab.arrays import Floats
 from gyrostab.errors import SchemaError
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
+from gyrostab.physics.base import Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.physics.phase import (
     fold,
     resonance_density,
@@ -80,7 +81,7 @@ class ScaleFactor(Effect):
             self.thermal
         )
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         if self.rotation == "channel":
             rate = chunk.drivers["rotation_rate"] * HOUR
         else:
@@ -158,7 +159,7 @@ class Misalignment(Effect):
         """List the axes that leak in, if their recorded rates do."""
         return self.list_sizes() if self.motion == "recorded" else ()
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         error = np.zeros(chunk.shape)
         rates = chunk.recorded if self.motion == "recorded" else chunk.true
         for source in self.list_sizes():
@@ -264,7 +265,7 @@ class RealMotion(Effect):
 
         return begin_process(oscillator(self.frequency, self.quality, setup.rate), rng), None
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         from gyrostab.kernels.random.coloured import read_process
 
         process, tilt = state
@@ -288,7 +289,7 @@ class RealMotion(Effect):
         direction = self.expand_to_axes("direction", chunk.setup.axes)[:, None]
         return direction * motion, (process, tilt)
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         return {"frequency": windows.frequency, "quality": np.array([5.0, 20.0, 80.0])}
 
     def explain(self, windows: Windows) -> Prediction:

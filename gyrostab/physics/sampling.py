@@ -9,9 +9,10 @@ from typing import Any, Self
 
 import numpy as np
 
+from gyrostab.arrays import Floats
 from gyrostab.errors import OptionError
 from gyrostab.noise import sampled_psd
-from gyrostab.physics.base import Array, Chunk, Effect, Prediction, Setup, Windows, parameter
+from gyrostab.physics.base import Chunk, Effect, Prediction, Setup, Windows, parameter
 from gyrostab.units import HOUR
 
 #: Samples of a fast instrument (`instrument = 0`) per sample of the log: they resolve its low-pass.
@@ -131,7 +132,7 @@ class LoggerFilter(Effect):
         whole = math.floor(samples + _MIN_PART)
         return whole, samples - whole if samples - whole > _MIN_PART else 0.0
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         sections, inner, memory = state
         oversampling = chunk.setup.oversampling
         samples = self._samples_at(oversampling)
@@ -208,7 +209,7 @@ class LoggerFilter(Effect):
             }
         )
 
-    def _digital_response(self, f: Array, rate: float, n: int) -> Array:
+    def _digital_response(self, f: Floats, rate: float, n: int) -> Floats:
         """Return the power response at frequencies of an instrument with `n` samples per sample."""
         fast = n * rate
         if self.cutoff >= fast / 2.0:
@@ -245,7 +246,7 @@ class LoggerFilter(Effect):
         return f"The logger filters {self.on_axes()}: {filters}; its samples are {sampling}."
 
 
-def _average_samples(signal: Array, count: int) -> Array:
+def _average_samples(signal: Floats, count: int) -> Floats:
     """Average each `count` samples."""
     if count == 1:
         return signal
@@ -304,7 +305,7 @@ class ClockError(Effect):
         "text", "how a sample is taken", default="latest", choices=("latest", "average")
     )
 
-    def slip(self, seconds: Array, duration: float) -> Array:
+    def slip(self, seconds: Floats, duration: float) -> Floats:
         """Compute the lead of the stamps over true time [s] at counted `seconds` of `duration`."""
         error, drift = self.error * _PPM, self.drift * _PPM / HOUR
 
@@ -337,7 +338,7 @@ class ClockError(Effect):
             )
         return keep, None
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         keep, memory = state
         if not (self.error or self.drift):
             return chunk.signal, state
@@ -372,7 +373,7 @@ class ClockError(Effect):
         return f"The clock of the samples is {fast} by {number}{more} {self.on_axes()}."
 
 
-def _means_between(history: Array, start: int, read: Array) -> Array:
+def _means_between(history: Floats, start: int, read: Floats) -> Floats:
     """Average held samples between successive positions less than two samples apart.
 
     `history` begins with sample `start`.

@@ -8,9 +8,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from gyrostab.arrays import Floats
 from gyrostab.errors import OptionError
 from gyrostab.noise import NORMAL_95
-from gyrostab.physics.base import Array, Chunk, Effect, Likeness, Prediction, Windows, parameter
+from gyrostab.physics.base import Chunk, Effect, Likeness, Prediction, Windows, parameter
 from gyrostab.units import HOUR, INNER
 
 _MINUTE = 60.0
@@ -21,7 +22,7 @@ _NO_LAG_S = 1e-3
 _SENSOR_LAGS_S = np.array([0.0, 20.0])
 
 
-def _true_temperature(sensor_lag: float, chunk: Chunk, last: float | None) -> tuple[Array, Any]:
+def _true_temperature(sensor_lag: float, chunk: Chunk, last: float | None) -> tuple[Floats, Any]:
     """Return the temperature ahead of a lagging sensor, and the last reading of the chunk."""
     reading = np.ascontiguousarray(chunk.drivers["temperature"])
     if not (sensor_lag and chunk.size):
@@ -79,12 +80,12 @@ class TemperatureBias(Effect):
         """List the temperature if its sensor lags: its change would be that of the noise."""
         return self.needs() if self.sensor_lag else ()
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         temperature, state = _true_temperature(self.sensor_lag, chunk, state)
         above = temperature - self.reference
         return above * (self.sensitivity + above * (self.quadratic + above * self.cubic)), state
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         return {"sensor_lag": _SENSOR_LAGS_S}
 
     def explain(self, windows: Windows) -> Prediction:
@@ -189,7 +190,7 @@ class Shupe(Effect):
         """List the temperature, because its rate of change would be that of the noise."""
         return self.needs()
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         from gyrostab.kernels.thermal import relax, slab
 
         temperature = chunk.drivers["temperature"]
@@ -205,7 +206,7 @@ class Shupe(Effect):
         felt = felt + np.stack([whole @ ahead * change, halves @ ahead * change])
         return _MINUTE * (self.sensitivity * felt[0] + self.transient * felt[1]), state
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         """List lags from none to thick windings, with sensors on the winding and off it."""
         return {
             "lag": np.append(_NO_LAG_S, np.geomspace(30.0, 3000.0, 6)),
@@ -251,7 +252,7 @@ def _with_lag(effect: Shupe | ThermalGradient, errors: Mapping[str, float] | Non
     return "without a lag"
 
 
-def _average_changes(windows: Windows, at: Array, values: Array, lag: float) -> Array:
+def _average_changes(windows: Windows, at: Floats, values: Floats, lag: float) -> Floats:
     """Average a lagged rate of change over the windows [unit of the values min-1]."""
     from gyrostab.kernels.thermal import mean_changes
 
@@ -298,7 +299,7 @@ class ThermalGradient(Effect):
         """List both temperatures if the effect follows the change of their difference."""
         return self.needs() if self.change else ()
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         from gyrostab.kernels.thermal import relax
 
         difference = chunk.drivers["temperature"] - chunk.drivers["temperature_2"]
@@ -308,7 +309,7 @@ class ThermalGradient(Effect):
         felt, state = relax(difference, chunk.rate, np.array([self.lag]), np.ones((1, 1)), carry)
         return self.sensitivity * difference + _MINUTE * self.change * felt[0], state
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         return {"lag": np.append(_NO_LAG_S, np.geomspace(10.0, 1000.0, 5))}
 
     def explain(self, windows: Windows) -> Prediction:
@@ -382,7 +383,7 @@ class ThermalHysteresis(Effect):
         """List the temperature, because its extremes would be those of the noise."""
         return self.needs()
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         from gyrostab.kernels.thermal import apply_dead_band
 
         # behind a lagging sensor, the temperature is known from the second reading on
@@ -396,7 +397,7 @@ class ThermalHysteresis(Effect):
             bias[begin:] = self.sensitivity * (known - follower_course)
         return bias, (lagged, follower) if chunk.size else state
 
-    def nuisance(self, windows: Windows) -> Mapping[str, Array]:
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
         """List dead bands up to a third of the range of the temperature."""
         return {
             "width": np.ptp(windows.drivers["temperature"])

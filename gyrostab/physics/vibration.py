@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from gyrostab.arrays import Floats
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import (
-    Array,
     Chunk,
     Effect,
     Likeness,
@@ -36,7 +36,7 @@ class _Vector(Effect):
     def needs(self) -> tuple[str, ...]:
         return tuple(channel for channel in self.channels if getattr(self, channel[-1]))
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         bias = np.zeros(chunk.size)
         for channel in self.needs():
             bias += getattr(self, channel[-1]) * chunk.drivers[channel]
@@ -136,7 +136,7 @@ class VibrationRectification(Effect):
         "deg/h/g^4", "bias per mean square squared", default=0.0, typical=1e-7, limit=1.0
     )
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         square = chunk.drivers["vibration"] ** 2
         return square * (self.sensitivity + square * self.quartic), state
 
@@ -232,7 +232,7 @@ class AliasedVibration(Effect):
         average, mount = self.sampling == "average", (self.resonance, self.quality)
         return begin_process(band(self.low, self.high, setup.rate, *mount, average=average), rng)
 
-    def generate(self, chunk: Chunk, state: Any) -> tuple[Array, Any]:
+    def generate(self, chunk: Chunk, state: Any) -> tuple[Floats, Any]:
         from gyrostab.kernels.random.coloured import read_process
 
         values, state = read_process(state, chunk.size)
@@ -251,11 +251,11 @@ class AliasedVibration(Effect):
         power = windows.drivers["vibration"] ** 2
         return Prediction(spectrum={"sensitivity": power[:, None] * folded}, coherent=True)
 
-    def _fold_density(self, frequency: Array, rate: float) -> Array:
+    def _fold_density(self, frequency: Floats, rate: float) -> Floats:
         """Return the two-sided density of the samples [Hz-1] for unit sensitivity and vibration."""
         from gyrostab.kernels.random.coloured import band_psd, folded_psd
 
-        def density(f: Array) -> Array:
+        def density(f: Floats) -> Floats:
             return band_psd(f, self.low, self.high, self.resonance, self.quality)
 
         average = self.sampling == "average"

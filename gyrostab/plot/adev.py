@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.allan.confidence import interval_limits
 from gyrostab.allan.variance import surface_columns, variance_name
+from gyrostab.arrays import Floats
 from gyrostab.errors import OptionError
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import (
@@ -151,7 +151,7 @@ def _select_window(part: xr.Dataset, when: Any) -> int:
     return int(np.argmin(np.abs(time - stamp)))
 
 
-def fitted_curves(product: xr.Dataset) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def fitted_curves(product: xr.Dataset) -> tuple[Floats, Floats]:
     """Compute the Allan variance of the fitted terms [degree2 hour-2].
 
     Returns
@@ -182,8 +182,8 @@ def fitted_curves(product: xr.Dataset) -> tuple[NDArray[np.float64], NDArray[np.
 def _draw_terms(
     panel: Axes,
     window: xr.Dataset,
-    terms: NDArray[np.float64],
-    total: NDArray[np.float64],
+    terms: Floats,
+    total: Floats,
     colours: list[str],
 ) -> None:
     """Draw the fitted curve in black and observed terms dashed; list limits in the legend."""

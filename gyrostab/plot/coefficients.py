@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import (
     GREY,
@@ -160,7 +160,7 @@ def _set_scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) 
         write_in_middle(panel, "not observable in any window")
 
 
-def find_shown_values(product: xr.Dataset, symbol: str) -> NDArray[Any]:
+def find_shown_values(product: xr.Dataset, symbol: str) -> Array:
     """Find the values and upper limits of a term that figures show, if they are above zero."""
     state = product["observable"].sel(term=symbol).values
     shown = (

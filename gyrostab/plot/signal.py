@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.errors import OptionError
 from gyrostab.ingest.convert import as_log
 from gyrostab.plot.style import (
@@ -116,9 +116,7 @@ def plot_signal(
     return figure
 
 
-def thin(
-    values: xr.DataArray, *, columns: int = 1500
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+def thin(values: xr.DataArray, *, columns: int = 1500) -> tuple[Array, Array, Array]:
     """Find the smallest and largest sample of every column of a long record.
 
     Parameters
@@ -165,7 +163,7 @@ def _draw_trace(panel: Axes, values: xr.DataArray, colour: str, columns: int) ->
     panel.grid(alpha=0.3)
 
 
-def _find_gaps(log: xr.Dataset, columns: int) -> tuple[NDArray[Any], NDArray[Any]]:
+def _find_gaps(log: xr.Dataset, columns: int) -> tuple[Array, Array]:
     """Find start and end of the gaps: from the gap table, else columns missing on all axes."""
     if "gap_start" in log.variables and "gap_end" in log.variables:
         return log["gap_start"].values, log["gap_end"].values

@@ -11,8 +11,8 @@ from typing import IO, TYPE_CHECKING, Any, ParamSpec, cast
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.schema import check_coefficients, require_dataset
 from gyrostab.time.durations import format_duration
@@ -112,7 +112,7 @@ def unit_of_time(seconds: float) -> tuple[float, str]:
     )
 
 
-def log_edges(values: NDArray[Any]) -> NDArray[Any]:
+def log_edges(values: Array) -> Array:
     """Find the edges of cells around rising values, half-way between them in the logarithm."""
     logs = np.log(values)
     inner = (logs[1:] + logs[:-1]) / 2
@@ -276,7 +276,7 @@ def write_in_middle(panel: Axes, text: str) -> None:
     panel.text(0.5, 0.5, text, transform=panel.transAxes, ha="center", va="center")
 
 
-def time_axis(ax: Axes, times: NDArray[Any]) -> None:
+def time_axis(ax: Axes, times: Array) -> None:
     """Label the time axis with dates and times, as short as is unambiguous."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
@@ -288,7 +288,7 @@ def time_axis(ax: Axes, times: NDArray[Any]) -> None:
         ax.set_xlim(times[0], times[-1])
 
 
-def find_runs(mask: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+def find_runs(mask: Array) -> tuple[Array, Array]:
     """Find the first index of each run of True, and the index after its last."""
     steps = np.diff(np.concatenate([[0], mask.astype(int), [0]]))
     return np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.allan.variance import variance_name
+from gyrostab.arrays import Array
 from gyrostab.errors import OptionError
 from gyrostab.plot.style import (
     INCH_MM,
@@ -229,7 +229,7 @@ def plot_davar_3d(
 
 def _merge_windows(
     product: xr.Dataset, names: list[str], columns: int
-) -> tuple[list[tuple[NDArray[Any], NDArray[Any]]], int]:
+) -> tuple[list[tuple[Array, Array]], int]:
     """Average windows to at most `columns`, and count the windows per column.
 
     The cells of an axis are the Allan deviation and the mask of weighted cells, shape (time, tau).
@@ -244,14 +244,14 @@ def _merge_windows(
     return list(zip(deviation, weighted & np.isfinite(deviation), strict=True)), merged
 
 
-def _divide_by_median(deviation: NDArray[Any]) -> NDArray[Any]:
+def _divide_by_median(deviation: Array) -> Array:
     """Divide by the median over time; NaN where that is zero, as of a constant signal."""
     cells = pd.DataFrame(deviation)
     median = cells.median()
     return (cells / median.where(median > 0.0)).to_numpy()
 
 
-def _colour_limits(values: list[NDArray[Any]], *, relative: bool) -> tuple[float, float]:
+def _colour_limits(values: list[Array], *, relative: bool) -> tuple[float, float]:
     finite = np.concatenate([value[np.isfinite(value) & (value > 0)] for value in values])
     if not finite.size:
         return (0.5, 2.0)
@@ -276,7 +276,7 @@ def _label_colours(bar: Any, *, relative: bool) -> None:
         bar.minorticks_off()
 
 
-def find_time_edges(time: NDArray[Any], merged: int = 1, step: Any = None) -> NDArray[Any]:
+def find_time_edges(time: Array, merged: int = 1, step: Any = None) -> Array:
     """Find the edges of the columns, half-way between window centres."""
     stamps = to_nanoseconds(time)
     half = (
@@ -292,9 +292,7 @@ def find_time_edges(time: NDArray[Any], merged: int = 1, step: Any = None) -> ND
     return np.array([stamps[0] - half, *inner, stamps[-1] + half]).astype("datetime64[ns]")
 
 
-def _mark_weighted(
-    panel: Axes, time_edges: NDArray[Any], tau: NDArray[Any], weighted: NDArray[Any]
-) -> None:
+def _mark_weighted(panel: Axes, time_edges: Array, tau: Array, weighted: Array) -> None:
     """Mark weighted cells with dots, thinned so that they stay distinguishable."""
     max_columns = 30 if is_narrow(panel.figure) else 60
     columns = np.arange(0, weighted.shape[0], -(-weighted.shape[0] // max_columns))

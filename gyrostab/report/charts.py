@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.time.stamps import to_nanoseconds
 
 if TYPE_CHECKING:
@@ -118,9 +119,7 @@ def new_chart(**layout: Any) -> go.Figure:
     return go.Figure(layout={**shared, **layout})
 
 
-def log_axis(
-    title: str, values: NDArray[np.float64], *, labels: int = 12, **options: Any
-) -> dict[str, Any]:
+def log_axis(title: str, values: Floats, *, labels: int = 12, **options: Any) -> dict[str, Any]:
     """Label a logarithmic axis at 1, 2 and 5 of each decade, or with many decades at 1 only."""
     shown = values[np.isfinite(values) & (values > 0)]
     decades = np.log10(shown.max() / shown.min()) if shown.size else 1.0
@@ -129,7 +128,7 @@ def log_axis(
     return {"type": "log", "title": title_, "tickformat": "~g", "dtick": step, **options}
 
 
-def milliseconds(product: xr.Dataset) -> NDArray[np.float64]:
+def milliseconds(product: xr.Dataset) -> Floats:
     """Return window centres as plotly counts them [ms since 1970]."""
     return np.asarray(to_nanoseconds(product["time"].values) / 1e6)
 
@@ -144,7 +143,7 @@ def plain_text(value: Any) -> str:
     return html.escape(str(value))
 
 
-def decade_bar(values: NDArray[np.float64]) -> dict[str, Any]:
+def decade_bar(values: Floats) -> dict[str, Any]:
     """Label a colour scale of logarithms with the numbers themselves."""
     shown = values[np.isfinite(values)]
     low, high = (shown.min(), shown.max()) if shown.size else (0.0, 1.0)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.noise import NORMAL_95
 from gyrostab.plot.style import COLOURS, axis_names, axis_style, unit_label
 from gyrostab.plot.surface import CHANGE_CMAP
@@ -74,9 +74,7 @@ def _find_regions(
     ]
 
 
-def _find_change(
-    surfaces: xr.Dataset, case: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _find_change(surfaces: xr.Dataset, case: str) -> tuple[Floats, Floats]:
     """Divide the Allan deviation of the recording by that of a simulation, (axis, tau, window).
 
     The second array is the opacity of each cell, less inside the 95 % band of the simulation.
@@ -102,9 +100,7 @@ def _select_channels(surfaces: xr.Dataset, content: Mapping[str, Any]) -> list[s
     ][:_MAX_CHANNELS]
 
 
-def _centre_stamps(
-    surfaces: xr.Dataset, content: Mapping[str, Any], kind: str = ""
-) -> NDArray[np.float64]:
+def _centre_stamps(surfaces: xr.Dataset, content: Mapping[str, Any], kind: str = "") -> Floats:
     """Return the centres of windows, or with "block_" of blocks [ms since 1970]."""
     start = np.datetime64(content["recording"]["start"].removesuffix("Z"), "ns").astype(np.int64)
     seconds = (surfaces[f"{kind}begin"].values + surfaces[f"{kind}end"].values) / 2.0
@@ -173,9 +169,7 @@ def _region_label(region: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _band_outline(
-    x: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _band_outline(x: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats]:
     """Return the outline of a band: a polygon for each stretch without a missing value.
 
     Examples
@@ -252,9 +246,7 @@ def _limit_means(part: xr.Dataset) -> tuple[float, float] | None:
     return float(shown.min() - margin), float(shown.max() + margin)
 
 
-def _add_cases(
-    figure: go.Figure, surfaces: xr.Dataset, x: NDArray[np.float64], values: xr.DataArray
-) -> None:
+def _add_cases(figure: go.Figure, surfaces: xr.Dataset, x: Floats, values: xr.DataArray) -> None:
     """Add lines of the simulations before (dashed) and after, in the colour of each axis."""
     for name in axis_names(surfaces):
         colour = axis_style(surfaces, name)["color"]

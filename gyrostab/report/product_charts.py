@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.allan.confidence import interval_limits
 from gyrostab.allan.variance import variance_name
+from gyrostab.arrays import Floats
 from gyrostab.noise import LAWS
 from gyrostab.plot.adev import fitted_curves
 from gyrostab.plot.coefficients import find_shown_values
@@ -259,7 +259,7 @@ def _add_coefficient(
         )
 
 
-def _log_deviation(product: xr.Dataset) -> NDArray[np.float64]:
+def _log_deviation(product: xr.Dataset) -> Floats:
     """Return the logarithm of the Allan deviation of the first axis, (tau, time)."""
     avar = product["avar"].values[0].T
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.plot.style import (
     INCH_MM,
     MARKERS,
@@ -116,7 +117,7 @@ def _draw_map(panel: Axes, times: NDArray[np.datetime64], trace: Any, scale: Any
     panel.set_ylim(*edges[1][[0, -1]])
 
 
-def _draw_scatter(panel: Axes, x: NDArray[Any], trace: Any) -> Any:
+def _draw_scatter(panel: Axes, x: Array, trace: Any) -> Any:
     """Draw a line, points or a band; return what the legend shows of it."""
     if trace.fill:
         panel.fill(x, trace.y, color=trace.fillcolor, alpha=trace.opacity, linewidth=0.0)

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import STAGES, Chunk, Effect, Setup
 from gyrostab.simulate.drivers import Source
@@ -21,7 +21,6 @@ from gyrostab.simulate.noise import NoiseState, Units, draw, shape
 from gyrostab.time.grid import grid_times
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
 #: Results that a chain keeps, for the threads that ask for them a little later.
 RECENT = 3
 #: States that a chain keeps over its whole length, to begin again from.
@@ -55,7 +54,7 @@ class Plan:
     turning: str
     #: (n, 2): samples that are missing on all axes, [first, one past last], rising; not those of
     #: the recording that the log is simulated like.
-    gaps: NDArray[np.int64]
+    gaps: Ints
     recorded: Mapping[str, str]  # axis -> source of its recorded rate
     bias: tuple[float, ...]  # constant rate of each axis [degree hour-1]
 
@@ -75,7 +74,7 @@ def next_block(
     first: int,
     count: int,
     units: Sequence[Units],
-) -> tuple[Array, BlockState]:
+) -> tuple[Floats, BlockState]:
     """Make the samples ``first`` to ``first + count`` of a log.
 
     Parameters
@@ -128,7 +127,7 @@ def next_block(
         values, state.effects[number] = step.effect.generate(chunk, state.effects[number])
         return step, values
 
-    def change(stage: str, signal: Array, **options: Any) -> None:
+    def change(stage: str, signal: Floats, **options: Any) -> None:
         for number in by_stage[stage]:
             rows = list(plan.steps[number].rows)
             _, values = act(number, signal=signal[rows], **options)
@@ -160,8 +159,8 @@ def _add_noise(
     numbers: list[int],
     act: Any,
     units: Sequence[Units],
-    true: Mapping[str, Array],
-) -> tuple[Array, Array]:
+    true: Mapping[str, Floats],
+) -> tuple[Floats, Floats]:
     """True rate and noise, with the noise at the level that the effects give it; its Q and N."""
     size = units[0].size
     signal = np.stack([true[axis] + bias for axis, bias in zip(plan.axes, plan.bias, strict=True)])
@@ -205,13 +204,13 @@ def _sample_log(
     plan: Plan,
     numbers: list[int],
     act: Any,
-    signal: Array,
-    white: Array,
-    true: Mapping[str, Array],
+    signal: Floats,
+    white: Floats,
+    true: Mapping[str, Floats],
     count: int,
-) -> Array:
+) -> Floats:
     """The samples of the log: those that an effect picked, or means over the sampling interval."""
-    rows: list[Array] = list(signal)
+    rows: list[Floats] = list(signal)
     for number in numbers:
         chosen = list(plan.steps[number].rows)
         inputs = [rows[row] for row in chosen]
@@ -232,7 +231,7 @@ def _sample_log(
     )
 
 
-def _drop_gaps(plan: Plan, rate: Array, first: int) -> None:
+def _drop_gaps(plan: Plan, rate: Floats, first: int) -> None:
     """Put NaN into the gaps."""
     count = rate.shape[1]
     for begin, end in plan.gaps[
@@ -328,7 +327,7 @@ def _go_block(log: _Log, number: int, *predecessors: Any) -> Any:
     return log.blocks.go(number)
 
 
-def _make_rates(log: _Log, number: int, made: Any) -> NDArray[np.float64]:
+def _make_rates(log: _Log, number: int, made: Any) -> Floats:
     return np.asarray(log.blocks(number) if made is None else made)
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.errors import OptionError
 from gyrostab.schema import RESERVED_NAMES
 from gyrostab.time.durations import duration_seconds
@@ -17,7 +17,6 @@ from gyrostab.time.grid import time_coordinate
 from gyrostab.time.stamps import stamp_ns
 from gyrostab.units import INNER, parse_unit
 
-Array = NDArray[np.float64]
 #: Longest log [s].
 MAX_DURATION_S = 1e9
 #: Table of a profile: rows of a time [s] and what holds there.
@@ -54,7 +53,7 @@ def convert_units(environment: xr.Dataset) -> xr.Dataset:
 
 def check_points(
     points: Any, where: str, columns: Sequence[str], *, optional: bool = False
-) -> Array:
+) -> Floats:
     """Rows of numbers, the first of which is a time that does not fall; none if `optional`."""
     if optional and not len(points):
         return np.empty((0, len(columns)))
@@ -77,11 +76,11 @@ def check_points(
     return table
 
 
-def piecewise(points: Array, *, held: bool) -> Callable[[Array], Array]:
+def piecewise(points: Floats, *, held: bool) -> Callable[[Floats], Floats]:
     """Make a function of time through `points` (time, value), piecewise constant or linear."""
     times, values = points.T
 
-    def at(seconds: Array) -> Array:
+    def at(seconds: Floats) -> Floats:
         if held:
             return np.asarray(
                 values[np.maximum(np.searchsorted(times, seconds, side="right") - 1, 0)]
@@ -94,7 +93,7 @@ def piecewise(points: Array, *, held: bool) -> Callable[[Array], Array]:
 def channel(
     name: str,
     unit: str,
-    values: Callable[[Array], Array],
+    values: Callable[[Floats], Floats],
     *,
     duration: Any,
     start: Any = "1970-01-01",
@@ -152,8 +151,8 @@ def count_samples(seconds: float, sensor_rate: float) -> int:
     return math.ceil(seconds * sensor_rate - 1e-6) + 1
 
 
-def _sample_values(values: Callable[[Array], Array], size: int, rate: float) -> Any:
-    def part(first: int, count: int) -> Array:
+def _sample_values(values: Callable[[Floats], Floats], size: int, rate: float) -> Any:
+    def part(first: int, count: int) -> Floats:
         return np.asarray(values((first + np.arange(count)) / rate), dtype=np.float64)
 
     if size <= _EAGER:

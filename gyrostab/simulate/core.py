@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Ints
 from gyrostab.errors import OptionError, SchemaError, UnitError
 from gyrostab.ingest.convert import as_log
 from gyrostab.ingest.gap_table import gap_variables
@@ -53,9 +53,9 @@ _COURSE = "course of "  # source of an effect, in front of the name of a recorde
 class GapTables(NamedTuple):
     """Gaps of the log by `gap_table`, in which gaps that overlap are one."""
 
-    all: NDArray[np.int64]
-    restarts: NDArray[np.int64]  # losses of power, without other gaps that overlap them
-    added: NDArray[np.int64]  # gaps that a recording does not have
+    all: Ints
+    restarts: Ints  # losses of power, without other gaps that overlap them
+    added: Ints  # gaps that a recording does not have
 
 
 def simulate(
@@ -315,7 +315,7 @@ def _begin_states(plan: Plan, seed: int) -> BlockState:
 
 
 def _label_log(
-    model: Model, frame: Frame, environment: xr.Dataset, table: NDArray[np.int64], data: Any
+    model: Model, frame: Frame, environment: xr.Dataset, table: Ints, data: Any
 ) -> xr.Dataset:
     gaps = [name for name, variable in environment.variables.items() if variable.dims == ("gap",)]
     log = environment.drop_vars(gaps).assign(

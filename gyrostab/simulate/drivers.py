@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import SchemaError
 from gyrostab.kernels.regression.smooth import smooth_curve
 from gyrostab.store.lazy import read_slice
@@ -17,7 +17,6 @@ from gyrostab.time.grid import TimeGridIndex, grid_index, grid_times
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import INNER
 
-Array = NDArray[np.float64]
 #: Longer channels are read stretch by stretch.
 SHORT = 2**22
 #: Parts over which a recorded channel is averaged: a quarter of a block of the diagnosis [s], and
@@ -35,7 +34,7 @@ class Source:
     units: str  # its unit
     held: bool  # values hold until the next one; otherwise they run straight towards it
     #: Instants of the values [ns since 1970]; None for a long channel.
-    stamps: NDArray[np.int64] | None
+    stamps: Ints | None
     values: Any  # the values; a long channel may have NaN
     #: Grid of a long channel: first stamp [ns since 1970], samples in a second [Hz].
     start: int = 0
@@ -45,11 +44,11 @@ class Source:
 
     def at(
         self,
-        instants: NDArray[np.int64],
+        instants: Ints,
         carry: float | None = None,
         *,
         before: int | None = None,
-    ) -> tuple[Array, float | None]:
+    ) -> tuple[Floats, float | None]:
         """Interpolate at increasing `instants` [ns since 1970].
 
         The values of a long channel are read from those for the time `before` the first instant on.
@@ -77,7 +76,7 @@ class Source:
             )
         return interpolated, float(filled[place[-1]])
 
-    def _interpolate_between(self, instants: NDArray[np.int64]) -> Array:
+    def _interpolate_between(self, instants: Ints) -> Floats:
         stamps = self.stamps
         assert stamps is not None
         if self.held:
@@ -92,7 +91,7 @@ class Source:
         return np.asarray(np.interp(at, knots, self.values[low:high]))
 
 
-def _fill_gaps(values: Array) -> Array:
+def _fill_gaps(values: Floats) -> Floats:
     """Each NaN replaced by the number before it."""
     good = ~np.isnan(values)
     return np.asarray(values[np.maximum.accumulate(np.where(good, np.arange(values.size), 0))])
@@ -184,7 +183,7 @@ def make_course(log: xr.Dataset, name: str) -> Source:
     return replace(source, stamps=stamps, values=smooth)
 
 
-def _average_parts(source: Source) -> tuple[NDArray[np.int64], Array]:
+def _average_parts(source: Source) -> tuple[Ints, Floats]:
     """Return the middles of parts of a channel [ns since 1970], and its means there."""
     if source.stamps is None:
         size, first = source.size, source.start

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.errors import OptionError
 from gyrostab.simulate.channels import (
     HELD,
@@ -26,8 +26,6 @@ from gyrostab.simulate.channels import (
     piecewise,
 )
 from gyrostab.time.durations import duration_seconds
-
-Array = NDArray[np.float64]
 
 
 def _make_from_points(
@@ -223,7 +221,7 @@ def _make_temperature(
 
         felt, _ = lag_values(felt, sensor_rate, lag)
 
-    def values(t: Array) -> Array:
+    def values(t: Floats) -> Floats:
         return np.asarray(felt[np.rint(t * sensor_rate).astype(np.int64)])
 
     return channel(
@@ -281,7 +279,7 @@ def trip(
     pumps = check_points(circulation, "circulation of trip", ends, optional=True)
     depth = piecewise(table, held=False)
 
-    def mud(t: Array) -> Array:
+    def mud(t: Floats) -> Floats:
         warmth = gradient / 1000.0 * depth(t)
         flows = np.zeros(t.shape, dtype=bool)
         for begin, end in pumps:
@@ -328,7 +326,7 @@ def supply(
     table = check_points(loads, "loads of supply", columns, optional=True)
     end = duration_seconds(life, "life")
 
-    def voltage(t: Array) -> Array:
+    def voltage(t: Floats) -> Floats:
         used = np.clip(t / end, 0.0, 1.0)
         # a plateau that sags, then the end
         level = full - (full - empty) * (0.5 * used**2 + 0.5 * used**8)
@@ -373,7 +371,7 @@ def light_power(
     table = check_points(points if len(points) else [(0, 0)], "points of light_power", columns)
     more = piecewise(table, held=False)
 
-    def level(t: Array) -> Array:
+    def level(t: Floats) -> Floats:
         return np.asarray(power * 10.0 ** (-(loss * t / 3.6e6 + more(t)) / 10.0))
 
     return channel(

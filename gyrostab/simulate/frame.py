@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Ints
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.physics.registry import is_number
 from gyrostab.schema import GAP_CAUSES, log_channels
@@ -229,9 +229,7 @@ def _outside_error(item: str, first: int, last: int, frame: Frame) -> SchemaErro
     )
 
 
-def gap_table(
-    environment: xr.Dataset, frame: Frame, *, only: int | None = None
-) -> NDArray[np.int64]:
+def gap_table(environment: xr.Dataset, frame: Frame, *, only: int | None = None) -> Ints:
     """Convert and merge gaps: first missing, first present after, samples, rows, cause.
 
     With the cause `only`, others are left out.

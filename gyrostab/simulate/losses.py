@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.errors import OptionError
 from gyrostab.ingest.gap_table import gap_variables
 from gyrostab.schema import GAP_CAUSES
@@ -20,7 +20,7 @@ from gyrostab.units import HOUR
 _MISSING, _RESTART = (GAP_CAUSES.index(name) for name in ("missing", "restart"))
 
 
-def _make_table(spans: NDArray[np.float64], cause: int, duration: Any, start: Any) -> xr.Dataset:
+def _make_table(spans: Floats, cause: int, duration: Any, start: Any) -> xr.Dataset:
     """Make gaps from seconds within the log; they are cut to samples when the log is made."""
     inside = np.clip(spans.reshape(-1, 2), 0.0, duration_seconds(duration, "duration"))
     edges = np.rint(inside * 1e9).astype(np.int64)
@@ -50,7 +50,7 @@ def gaps(spans: Points, *, duration: Any = MAX_DURATION_S, start: Any = "1970-01
     return _make_table(_check_spans(spans, "spans of gaps"), _MISSING, duration, start)
 
 
-def _check_spans(spans: Points, where: str, *, optional: bool = False) -> NDArray[np.float64]:
+def _check_spans(spans: Points, where: str, *, optional: bool = False) -> Floats:
     table = check_points(spans, where, ("from [s]", "to [s]"), optional=optional)
     if np.any(table[:, 1] <= table[:, 0]):
         raise OptionError(f"{where}: {table.tolist()}: each must end after it begins")
@@ -115,9 +115,7 @@ def losses(
     return _make_table(spans, _MISSING, duration, start)
 
 
-def _draw_poisson(
-    rng: np.random.Generator, begin: float, end: float, per_hour: float
-) -> NDArray[np.float64]:
+def _draw_poisson(rng: np.random.Generator, begin: float, end: float, per_hour: float) -> Floats:
     if not 0.0 <= per_hour * (end - begin) <= 1e8:
         raise OptionError(
             f"{per_hour:g} gaps in an hour: give a number from 0 up, for at most 1e8 gaps in all"

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.errors import OptionError
 from gyrostab.kernels.random.stochastic import (
     brownian_means,
@@ -28,7 +28,6 @@ from gyrostab.noise import TERMS, URAD_PER_S
 from gyrostab.physics.phase import turn_means
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
 #: Lowest frequency of flicker noise [Hz] unless a model says otherwise: flat within 0.2 % to
 #: averaging times of 20 h.
 FLICKER_LOW = 5e-9
@@ -54,9 +53,9 @@ class NoiseState:
 
     rate: float
     streams: dict[str, np.random.Generator]
-    times: Array
+    times: Floats
     endless: bool
-    flicker: Array
+    flicker: Floats
     angle: float = 0.0
     walk: float = 0.0
 
@@ -109,7 +108,7 @@ def begin_noise(
     return state
 
 
-def _draw_uniform(rng: np.random.Generator, size: int) -> Array:
+def _draw_uniform(rng: np.random.Generator, size: int) -> Floats:
     """Rounding errors of unit variance."""
     return math.sqrt(12.0) * (rng.random(size) - 0.5)
 
@@ -132,7 +131,7 @@ def draw(state: NoiseState, first: int, size: int) -> tuple[Units, NoiseState]:
     return Units(first, size, values), state
 
 
-def _draw_flicker(state: NoiseState, rng: np.random.Generator, size: int) -> Array:
+def _draw_flicker(state: NoiseState, rng: np.random.Generator, size: int) -> Floats:
     """Flicker noise of unit strength, in pieces that stay in the processor's cache."""
     means = np.empty(size)
     for first in range(0, size, _PIECE):
@@ -151,7 +150,7 @@ def shape(
     carry: Mapping[str, float],
     *,
     ramp: float = 0.0,
-) -> tuple[Array, dict[str, float]]:
+) -> tuple[Floats, dict[str, float]]:
     """Scale the random numbers to their level.
 
     Parameters
@@ -174,7 +173,7 @@ def shape(
     carry : dict
         To be given to the next call.
     """
-    total: Array = np.asarray(
+    total: Floats = np.asarray(
         ramp * (units.first + 0.5 + np.arange(units.size)) / (HOUR * rate), dtype=np.float64
     )
     new_carry = dict(carry)
@@ -210,7 +209,7 @@ def make_noise(
     sinusoid: tuple[float, float, float] | None = None,
     flicker_band: tuple[float, float] = (FLICKER_LOW, math.inf),
     chunk: int = CHUNK,
-) -> Array:
+) -> Floats:
     """Make the noise of one gyro axis; each sample is the mean rate over its interval.
 
     The Allan variance is exactly that of the noise table at every averaging time: quantization

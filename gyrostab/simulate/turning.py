@@ -7,16 +7,14 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import OptionError
 from gyrostab.simulate.channels import HELD, Points, channel, check_points, combine
 from gyrostab.time.durations import duration_seconds
 
-Array = NDArray[np.float64]
 
-
-def _integrate_turns(table: Array, stick_slip: float, period: float) -> tuple[Any, Any]:
+def _integrate_turns(table: Floats, stick_slip: float, period: float) -> tuple[Any, Any]:
     """Compute rate [deg/s] and angle since the start [deg] from a table (time, rate).
 
     Stick-slip is added.
@@ -28,17 +26,17 @@ def _integrate_turns(table: Array, stick_slip: float, period: float) -> tuple[An
     angles = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2.0 * np.diff(times))])
     omega = 2.0 * math.pi / period
 
-    def pieces(t: Array) -> tuple[Array, NDArray[np.int64]]:
+    def pieces(t: Floats) -> tuple[Floats, Ints]:
         return np.clip(t, times[0], times[-1]), np.clip(
             np.searchsorted(times, t, side="right") - 1, 0, slope.size - 1
         )
 
-    def rate(t: Array) -> Array:
+    def rate(t: Floats) -> Floats:
         return np.asarray(np.interp(t, times, rates) * (1.0 - stick_slip * np.cos(omega * t)))
 
     def swing(
-        t: Array, base: Array, rise: Array
-    ) -> Array:  # integral of base(t) cos(omega t), base rising by `rise`
+        t: Floats, base: Floats, rise: Floats
+    ) -> Floats:  # integral of base(t) cos(omega t), base rising by `rise`
         return np.asarray(base * np.sin(omega * t) / omega + rise * np.cos(omega * t) / omega**2)
 
     # the oscillating part of the angle, up to the beginning of each piece
@@ -46,7 +44,7 @@ def _integrate_turns(table: Array, stick_slip: float, period: float) -> tuple[An
     part = np.where(np.diff(times) > 0.0, part, 0.0)  # a step takes no time
     swung = np.concatenate([[0.0], np.cumsum(part)])
 
-    def angle_from_first_point(t: Array) -> Array:
+    def angle_from_first_point(t: Floats) -> Floats:
         inside, j = pieces(t)
         base = rates[j] + slope[j] * (inside - times[j])
         plain = angles[j] + (rates[j] + base) / 2.0 * (inside - times[j])
@@ -58,7 +56,7 @@ def _integrate_turns(table: Array, stick_slip: float, period: float) -> tuple[An
 
     at_start = angle_from_first_point(np.zeros(1))
 
-    def angle(t: Array) -> Array:
+    def angle(t: Floats) -> Floats:
         return np.asarray(angle_from_first_point(t) - at_start)
 
     return rate, angle
@@ -122,7 +120,7 @@ def rotation(
     rate, angle = _integrate_turns(table, stick_slip, duration_seconds(period, "period"))
     tilt = math.radians(inclination)
 
-    def face(t: Array) -> Array:
+    def face(t: Floats) -> Floats:
         return np.asarray(np.radians(angle(t) + toolface))
 
     made = {

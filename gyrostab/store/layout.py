@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.errors import FormatError, reading_of
 from gyrostab.store.damage import is_blosc_cut
 from gyrostab.store.private import library_lock
@@ -47,17 +48,17 @@ class ChunkCache:
     def __init__(self, most_bytes: int, largest_bytes: int):
         self._max_bytes, self._max_chunk_bytes = most_bytes, largest_bytes
         self._bytes = 0
-        self._chunks: OrderedDict[tuple[Any, ...], NDArray[Any]] = OrderedDict()
+        self._chunks: OrderedDict[tuple[Any, ...], Array] = OrderedDict()
         self._lock = threading.Lock()
 
-    def get(self, key: tuple[Any, ...]) -> NDArray[Any] | None:
+    def get(self, key: tuple[Any, ...]) -> Array | None:
         """Return a chunk, or None when it is not stored."""
         with self._lock:
             if key in self._chunks:
                 self._chunks.move_to_end(key)
             return self._chunks.get(key)
 
-    def put(self, key: tuple[Any, ...], chunk: NDArray[Any]) -> None:
+    def put(self, key: tuple[Any, ...], chunk: Array) -> None:
         """Store a chunk, and drop the least recently used ones over the limit."""
         with self._lock:
             if key in self._chunks or chunk.nbytes > self._max_chunk_bytes:
@@ -109,9 +110,7 @@ def is_readable(path: Path, name: str) -> bool:
         return False
 
 
-def read_chunk(
-    path: Path, name: str, place: tuple[int, ...], *, zarr: bool, opened: str
-) -> NDArray[Any]:
+def read_chunk(path: Path, name: str, place: tuple[int, ...], *, zarr: bool, opened: str) -> Array:
     """Read one chunk as it is on disk, not scaled, in its full size.
 
     Parameters
@@ -216,7 +215,7 @@ class _Shuffle:
 
     width: int
 
-    def encode(self, data: NDArray[Any]) -> bytes:
+    def encode(self, data: Array) -> bytes:
         """Bring together the bytes of each place within the numbers of an array."""
         return data.reshape(-1, 1).view(np.uint8).T.tobytes()
 
@@ -237,7 +236,7 @@ class _Shuffle:
 class _Fletcher32:
     """The checksum at the end of a chunk."""
 
-    def encode(self, data: NDArray[Any]) -> NDArray[np.uint8]:
+    def encode(self, data: Array) -> NDArray[np.uint8]:
         """Add the checksum to the bytes of an array."""
         from numcodecs import Fletcher32
 
@@ -335,7 +334,7 @@ class _UnknownFilter:
         raise ChunkDamage(f"cannot be read: gyrostab does not support {self.name}")
 
 
-def _read_zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> NDArray[Any]:
+def _read_zarr_chunk(folder: Path, place: Sequence[int], opened: str) -> Array:
     layout = _read_zarr_layout(folder, opened)
     name = layout.separator.join(map(str, place))
     try:
@@ -393,7 +392,7 @@ def find_zarr_codecs(layout: dict[str, Any]) -> tuple[Any, ...]:
 
 def decode_chunk(
     data: Any, codecs: Sequence[Any], dtype: np.dtype[Any], size: int, *, name: str = ""
-) -> NDArray[Any]:
+) -> Array:
     """Decode the bytes of a chunk to numbers, of which a whole chunk has `size`.
 
     No codec makes more bytes than such a chunk needs, whatever the file holds.

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Ints
 from gyrostab.errors import reading_of
 
 
@@ -37,11 +37,11 @@ class Source:
         """Number of dimensions."""
         return len(self.shape)
 
-    def __getitem__(self, box: Any) -> NDArray[Any]:
+    def __getitem__(self, box: Any) -> Array:
         """Return the values in a box: one slice for each dimension, each with start and stop."""
         raise NotImplementedError
 
-    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+    def read_into(self, row: int, begin: int, out: Array) -> None:
         """Read samples of one row (0 in one dimension) from `begin` on into `out`."""
         along = slice(begin, begin + out.size)
         out[:] = self[along] if self.ndim == 1 else self[row : row + 1, along][0]
@@ -50,7 +50,7 @@ class Source:
 class RowSource(Source):
     """A source of one or two dimensions that reads samples of one row; see `Source.read_into`."""
 
-    def __getitem__(self, box: Any) -> NDArray[Any]:
+    def __getitem__(self, box: Any) -> Array:
         *above, last = box if isinstance(box, tuple) else (box,)
         begin, end, step = last.indices(self.shape[-1])
         rows: Any = range(self.shape[0])[above[0]] if above else range(1)
@@ -134,7 +134,7 @@ def keep_sources(array: Any, derived: Any) -> Any:
     )
 
 
-def read_into(array: Any, row: int, begin: int, out: NDArray[Any]) -> None:
+def read_into(array: Any, row: int, begin: int, out: Array) -> None:
     """Read samples of one row of an array into `out`, in the calling thread.
 
     Parameters
@@ -154,7 +154,7 @@ def read_into(array: Any, row: int, begin: int, out: NDArray[Any]) -> None:
         out[:] = read_box(array, box[-array.ndim :]).reshape(out.shape)
 
 
-def read_slice(array: Any, begin: int, end: int) -> NDArray[Any]:
+def read_slice(array: Any, begin: int, end: int) -> Array:
     """Read samples `begin` to `end` along the last dimension of an array, in the calling thread.
 
     Examples
@@ -165,7 +165,7 @@ def read_slice(array: Any, begin: int, end: int) -> NDArray[Any]:
     return read_box(array, (*(slice(None),) * (len(array.shape) - 1), slice(begin, end)))
 
 
-def read_box(array: Any, box: Sequence[slice]) -> NDArray[Any]:
+def read_box(array: Any, box: Sequence[slice]) -> Array:
     """Read the values of an array in a box, one slice per dimension, in the calling thread.
 
     Examples
@@ -196,7 +196,7 @@ class FileVariable(Source):
         self.variable, self.path = variable, path
         self.shape, self.dtype = variable.shape, variable.dtype
 
-    def __getitem__(self, box: Any) -> NDArray[Any]:
+    def __getitem__(self, box: Any) -> Array:
         with reading_of(str(self.path)):
             return np.asarray(self.variable[box].values)
 
@@ -204,15 +204,15 @@ class FileVariable(Source):
 class Converted(Source):
     """An array whose values are converted when they are read."""
 
-    def __init__(self, array: Any, convert: Callable[[NDArray[Any]], NDArray[Any]], dtype: Any):
+    def __init__(self, array: Any, convert: Callable[[Array], Array], dtype: Any):
         self.parts, self.convert = (array,), convert
         self.shape, self.dtype = array.shape, np.dtype(dtype)
 
-    def __getitem__(self, box: Any) -> NDArray[Any]:
+    def __getitem__(self, box: Any) -> Array:
         return self.convert(read_box(self.parts[0], box if isinstance(box, tuple) else (box,)))
 
 
-def convert_lazy(array: Any, convert: Callable[[NDArray[Any]], NDArray[Any]], dtype: Any) -> Any:
+def convert_lazy(array: Any, convert: Callable[[Array], Array], dtype: Any) -> Any:
     """Return a dask array of converted values; a source can still be read."""
     if find_source(array) is not None:
         return make_dask(Converted(array, convert, dtype), array.chunks)
@@ -258,7 +258,7 @@ class _Joined(RowSource):
         self.edges = np.cumsum([0, *(column.shape[-1] for column in columns)]).tolist()
         self.shape = (self.edges[-1],)
 
-    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+    def read_into(self, row: int, begin: int, out: Array) -> None:
         done, piece = 0, bisect_right(self.edges, begin) - 1
         while done < out.size:
             remaining = self.edges[piece + 1] - begin - done
@@ -281,7 +281,7 @@ class _Stacked(RowSource):
         self.parts, self.dtype = tuple(rows), rows[0].dtype
         self.shape = (len(rows), rows[0].shape[-1])
 
-    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+    def read_into(self, row: int, begin: int, out: Array) -> None:
         """Read samples of one row from `begin` on into `out`."""
         read_into(self.parts[row], 0, begin, out)
 
@@ -301,7 +301,7 @@ class _Selected(RowSource):
         self.parts, self.dtype, self.shape = (array,), array.dtype, shape
         self.row, self.begin = row, begin
 
-    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+    def read_into(self, row: int, begin: int, out: Array) -> None:
         source_row = row if self.row is None else self.row
         read_into(self.parts[0], source_row, self.begin + begin, out)
 
@@ -317,11 +317,11 @@ def select_part(array: Any, row: int | None, begin: int = 0, end: int | None = N
 class _Taken(RowSource):
     """Samples of an array of one dimension at some places."""
 
-    def __init__(self, array: Any, places: NDArray[np.int64]):
+    def __init__(self, array: Any, places: Ints):
         self.parts, self.dtype, self.shape = (array,), array.dtype, places.shape
         self.places = places
 
-    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+    def read_into(self, row: int, begin: int, out: Array) -> None:
         """Read samples from `begin` on into `out`, each run of neighbours at once."""
         places = self.places[begin : begin + out.size]
         edges = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), out.size]
@@ -330,7 +330,7 @@ class _Taken(RowSource):
                 read_into(self.parts[0], 0, int(places[first]), out[first:end])
 
 
-def take_samples(array: Any, places: NDArray[np.int64], chunk: int) -> Any:
+def take_samples(array: Any, places: Ints, chunk: int) -> Any:
     """Select the samples at `places` of an array of one dimension; a source can still be read."""
     if find_source(array) is None:
         return array[places]
@@ -344,7 +344,7 @@ class _Transposed(Source):
         self.parts, self.order, self.dtype = (source,), order, source.dtype
         self.shape = tuple(source.shape[place] for place in order)
 
-    def __getitem__(self, box: Any) -> NDArray[Any]:
+    def __getitem__(self, box: Any) -> Array:
         source_box = [box[self.order.index(place)] for place in range(self.ndim)]
         return np.asarray(self.parts[0][tuple(source_box)]).transpose(self.order)
 

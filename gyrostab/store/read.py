@@ -19,6 +19,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.errors import DamageError, FormatError, reading_of
 from gyrostab.kernels.encoding.counts import from_counts
 from gyrostab.store.damage import check_blosc_chunks, check_codecs, check_global_heaps
@@ -251,7 +252,7 @@ class _ChunkedVariable(RowSource):
     opened: str
     zarr: bool
 
-    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+    def read_into(self, row: int, begin: int, out: Array) -> None:
         """Read samples of one row; those of a damaged chunk are NaN."""
         end = begin + out.size
         for number in range(begin // self.length, -(-end // self.length)):
@@ -268,7 +269,7 @@ class _ChunkedVariable(RowSource):
                 self._handle_damage(row, number, str(damage))
                 place[:] = np.nan
 
-    def _decode_samples(self, raw: NDArray[Any], out: NDArray[np.floating[Any]]) -> None:
+    def _decode_samples(self, raw: Array, out: NDArray[np.floating[Any]]) -> None:
         if self.scale is not None:
             from_counts(raw, float(self.scale), int(self.missing), out=out)
             return
@@ -276,7 +277,7 @@ class _ChunkedVariable(RowSource):
         if self.missing is not None and self.missing == self.missing:
             out[raw == self.missing] = np.nan
 
-    def _read_chunk(self, row: int, number: int, *, is_whole: bool) -> NDArray[Any]:
+    def _read_chunk(self, row: int, number: int, *, is_whole: bool) -> Array:
         """Read one chunk as it is on disk; one that is not used as a whole is cached.
 
         The last chunk of a row is longer than the row.

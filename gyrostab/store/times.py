@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Ints
 from gyrostab.errors import FormatError, SchemaError
 from gyrostab.store.damage import check_blosc_chunks
 from gyrostab.store.lazy import RowSource, make_dask
@@ -118,7 +118,7 @@ class _GridStamps(RowSource):
         self.grid, self.divisor = grid, divisor
         self.shape, self.dtype = (grid.size,), np.dtype(np.int64)
 
-    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+    def read_into(self, row: int, begin: int, out: Array) -> None:
         stamps = self.grid.stamps_at(np.arange(begin, begin + out.size))
         np.floor_divide(stamps, self.divisor, out=out)
 
@@ -140,7 +140,7 @@ def has_whole_microseconds(
     return True
 
 
-def encode_stamps(name: Any, variable: xr.Variable, divisor: int) -> NDArray[np.int64]:
+def encode_stamps(name: Any, variable: xr.Variable, divisor: int) -> Ints:
     """Encode times as integer microseconds or nanoseconds since 1970."""
     stamps = variable.values
     if np.isnat(stamps).any():

@@ -18,6 +18,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Floats
 from gyrostab.kernels.encoding.counts import to_counts
 from gyrostab.store.layout import find_hdf5_codecs
 from gyrostab.store.lazy import convert_lazy, find_source, read_box
@@ -90,7 +91,7 @@ def as_counts(name: str, variable: xr.Variable) -> xr.Variable:
 
 
 def _pack_counts(
-    values: NDArray[np.float64], *, name: str, scale: float, dtype: str
+    values: Floats, *, name: str, scale: float, dtype: str
 ) -> NDArray[np.integer[Any]]:
     counts = to_counts(values, scale, dtype, FILL_VALUES[dtype])
     if counts is None:
@@ -205,7 +206,7 @@ def append_netcdf(
         for name, variable in large.items()
     }
 
-    def compress(name: str, values: NDArray[Any]) -> Any:
+    def compress(name: str, values: Array) -> Any:
         fill = fills[name]
         native = values.dtype.newbyteorder("=")  # that of the variable in the file
         chunk = np.full(chunks[name], 0 if fill is None else fill, native)
@@ -275,7 +276,7 @@ def append_zarr(
             **options,
         )
 
-    def put(name: str, box: _Box, values: NDArray[Any]) -> None:
+    def put(name: str, box: _Box, values: Array) -> None:
         targets[name][box] = values
 
     chunks = {name: encoding[name]["chunks"] for name in large}
@@ -290,7 +291,7 @@ _Box = tuple[slice, ...]
 def _copy_variables(
     large: Mapping[str, xr.Variable],
     chunks: Mapping[str, tuple[int, ...]],
-    encode: Callable[[str, NDArray[Any]], Any],
+    encode: Callable[[str, Array], Any],
     put: Callable[[str, _Box, Any], None],
     progress: Progress | None,
 ) -> None:
@@ -298,7 +299,7 @@ def _copy_variables(
     import dask
     from dask.system import CPU_COUNT
 
-    def read(chunk: tuple[str, _Box, NDArray[Any] | None]) -> tuple[str, _Box, int, Any]:
+    def read(chunk: tuple[str, _Box, Array | None]) -> tuple[str, _Box, int, Any]:
         name, box, values = chunk
         values = read_box(large[name].data, box) if values is None else values
         return name, box, values.size, encode(name, values)
@@ -316,7 +317,7 @@ def _copy_variables(
 
 def _list_chunks(
     large: Mapping[str, xr.Variable], chunks: Mapping[str, tuple[int, ...]]
-) -> Iterator[tuple[str, _Box, NDArray[Any] | None]]:
+) -> Iterator[tuple[str, _Box, Array | None]]:
     """List all chunks in the order of time; dask computes those that only it can read.
 
     It computes many at a time, as it walks a whole graph each time.
@@ -347,7 +348,7 @@ def _list_chunks(
 
 def _compute_chunks(
     large: Mapping[str, xr.Variable], batch: Sequence[tuple[str, _Box]]
-) -> Iterator[tuple[str, _Box, NDArray[Any]]]:
+) -> Iterator[tuple[str, _Box, Array]]:
     import dask
 
     arrays = dask.compute(*(large[name].data[box] for name, box in batch))

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Ints
 from gyrostab.errors import OptionError
 from gyrostab.wording import list_some
 
@@ -156,7 +156,7 @@ def _show_length(value: Any) -> str:
 
 def averaging_factors(
     taus: Any, *, rate: float, window: int, tau_max: Any = None, order: int = 2
-) -> NDArray[np.int64]:
+) -> Ints:
     """Find the averaging factors k of the requested averaging times ``k / rate``, in rising order.
 
     Parameters
@@ -224,7 +224,7 @@ def averaging_factors(
     return factors
 
 
-def _listed_factors(taus: Any, rate: float, longest: int, order: int) -> NDArray[np.int64]:
+def _listed_factors(taus: Any, rate: float, longest: int, order: int) -> Ints:
     """Return the averaging factors of a list of durations, of which `longest` is the largest."""
     ks, moved = [], []
     for tau in taus:

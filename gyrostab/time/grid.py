@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import xarray as xr
-from numpy.typing import NDArray
 from xarray.indexes import CoordinateTransform, CoordinateTransformIndex
 
+from gyrostab.arrays import Array, Bools, Floats, Ints
 from gyrostab.errors import OptionError, TimeError
 from gyrostab.time.stamps import NANOSECONDS, to_nanoseconds
 
@@ -91,7 +91,7 @@ def period_ns(rate: float) -> tuple[int, float]:
     return nanoseconds, float(period - nanoseconds)
 
 
-def grid_times(start: int, rate: float, index: Any) -> NDArray[np.int64]:
+def grid_times(start: int, rate: float, index: Any) -> Ints:
     """Compute the stamps [ns since 1970] of samples of a grid.
 
     Parameters
@@ -111,7 +111,7 @@ def grid_times(start: int, rate: float, index: Any) -> NDArray[np.int64]:
     return np.asarray(start + index * nanoseconds + np.rint(index * fraction).astype(np.int64))
 
 
-def grid_index(start: int, rate: float, stamps: Any) -> NDArray[np.float64]:
+def grid_index(start: int, rate: float, stamps: Any) -> Floats:
     """Compute the positions of `stamps` [ns since 1970] on the grid, in fractional samples."""
     nanoseconds, fraction = period_ns(rate)
     stamps = np.asarray(stamps, dtype=np.int64)
@@ -138,12 +138,12 @@ class GridTransform(CoordinateTransform):
         """Number of samples."""
         return len(self.samples)
 
-    def stamps_at(self, positions: Any) -> NDArray[np.int64]:
+    def stamps_at(self, positions: Any) -> Ints:
         """Return the stamps [ns since 1970] of places among the samples."""
         samples = self.samples.start + self.samples.step * np.asarray(positions, dtype=np.int64)
         return grid_times(self.start, self.rate, samples)
 
-    def find_positions(self, stamps: Any) -> NDArray[np.float64]:
+    def find_positions(self, stamps: Any) -> Floats:
         """Return the places of stamps among the samples, in fractions."""
         sample = grid_index(self.start, self.rate, to_nanoseconds(stamps))
         return np.asarray((sample - self.samples.start) / self.samples.step)
@@ -169,7 +169,7 @@ class GridTransform(CoordinateTransform):
         """Return other samples of the same grid."""
         return GridTransform(self.start, self.rate, samples, self.dims[0])
 
-    def end_stamps(self) -> NDArray[np.int64]:
+    def end_stamps(self) -> Ints:
         """Return the first and last stamp; two equal ones if there is none in between."""
         return self.stamps_at([0, max(self.size - 1, 0)])
 
@@ -273,7 +273,7 @@ class TimeGridIndex(CoordinateTransformIndex):
                 # "2026-11-20" or "2026-11-20T14": the whole day or hour, as in pandas
                 return _wrap_positions({dim: self._find_slice(slice(first, last))})
         if isinstance(label, str | date):  # also a pandas.Timestamp
-            times: NDArray[Any] = np.asarray(span_of(label)[0])
+            times: Array = np.asarray(span_of(label)[0])
         else:
             times = np.asarray(getattr(label, "values", label))
         if times.dtype.kind == "b":
@@ -297,9 +297,7 @@ class TimeGridIndex(CoordinateTransformIndex):
             return _wrap_positions({dim: xr.Variable(label.dims, positions)})
         return _wrap_positions({dim: int(positions) if positions.ndim == 0 else positions})
 
-    def _find_stamps(
-        self, stamps: NDArray[Any], method: Any, tolerance: Any
-    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def _find_stamps(self, stamps: Array, method: Any, tolerance: Any) -> tuple[Ints, Bools]:
         """Find the nearest samples of stamps, and whether each is exact or near enough."""
         if method not in (None, "nearest"):
             raise ValueError(

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Ints
 from gyrostab.errors import OptionError, TimeError
 
 NANOSECONDS = 10**9
@@ -24,7 +24,7 @@ _COMPACT_INSTANT = re.compile(
 )
 
 
-def to_nanoseconds(stamps: Any, *, far_as_nat: bool = False) -> NDArray[np.int64]:
+def to_nanoseconds(stamps: Any, *, far_as_nat: bool = False) -> Ints:
     """Convert datetime64 of any unit to integers; ``NaT`` becomes the lowest one.
 
     Dates before 1678 or after 2262 exceed 64 bits; numpy would wrap them around without an error.

@@ -12,8 +12,8 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.ingest.formats.layout import crc32_mpeg2
 from gyrostab.ingest.formats.matlab import keep_pandas_options
 
@@ -35,7 +35,7 @@ class Made(NamedTuple):
 
 
 def write_trace(
-    file: IO[bytes], code: str, values: NDArray[Any], rate: float, start: Any, **records: Any
+    file: IO[bytes], code: str, values: Array, rate: float, start: Any, **records: Any
 ) -> None:
     """Append a trace of miniSEED that starts at an instant, as integer [ns] or datetime64[ns]."""
     from pymseed import MS3TraceList

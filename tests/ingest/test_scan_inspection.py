@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.ingest.guess import guess_columns
 from gyrostab.ingest.guess_unit import EARTH_RATE_DPH, rate_plausibility
 from gyrostab.ingest.inspect import inspect_file
@@ -23,7 +23,7 @@ ROWS = 3000
 DEG_PER_RAD = 180 / np.pi
 
 
-def gyro_dps(*, fine: bool = False, seed: int = 3) -> NDArray[np.float64]:
+def gyro_dps(*, fine: bool = False, seed: int = 3) -> Floats:
     """Return three axes at rest [deg/s]: MEMS (0.3 deg/sqrt(h), bias 0.4 deg/s) or a fine gyro."""
     noise = np.random.default_rng(seed).standard_normal((3, ROWS))
     if fine:
@@ -34,14 +34,14 @@ def gyro_dps(*, fine: bool = False, seed: int = 3) -> NDArray[np.float64]:
     return noise * 0.3 / 60 * np.sqrt(RATE) + np.array([0.3, -0.2, 0.1])[:, None]
 
 
-def accelerations(*, gravity: float = 9.81, seed: int = 4) -> NDArray[np.float64]:
+def accelerations(*, gravity: float = 9.81, seed: int = 4) -> Floats:
     return (
         np.random.default_rng(seed).standard_normal((3, ROWS)) * 1e-3 * gravity
         + np.array([0.1, -0.05, 0.99])[:, None] * gravity
     )
 
 
-def write(path: Path, columns: dict[str, NDArray[np.float64]], *, header: bool = True) -> Path:
+def write(path: Path, columns: dict[str, Floats], *, header: bool = True) -> Path:
     pd.DataFrame(columns).to_csv(path, index=False, header=header, float_format="%.12g")
     return path
 
@@ -58,15 +58,15 @@ GX, GY, GZ = gyro_dps()
 AX, AY, AZ = accelerations()
 RADIANS = [values / DEG_PER_RAD for values in (GX, GY, GZ)]
 FINE = [values * 3600 for values in gyro_dps(fine=True)]
-Columns = dict[str, NDArray[np.float64]]
+Columns = dict[str, Floats]
 
 
-def named(names: str, columns: Sequence[NDArray[np.float64]]) -> Columns:
+def named(names: str, columns: Sequence[Floats]) -> Columns:
     return dict(zip(names.split(","), columns, strict=True))
 
 
 #: Columns, whether the file has a header, the gyro columns and their unit.
-LOGS: dict[str, tuple[Columns, bool, Sequence[NDArray[np.float64]], str]] = {
+LOGS: dict[str, tuple[Columns, bool, Sequence[Floats], str]] = {
     "letters": (
         named("t,wx,wy,wz,ax,ay,az", [TIME, GX, GY, GZ, AX, AY, AZ]),
         True,
@@ -221,7 +221,7 @@ def test_spans_of_time_are_part_of_the_command(
 
 @pytest.mark.parametrize(("kind", "values"), [("rate", GX), ("angle", np.cumsum(GX))])
 def test_angles_get_a_kind_in_the_command_and_keep_their_unit(
-    tmp_path: Path, monkeypatch, capsys, kind: str, values: NDArray[np.float64]
+    tmp_path: Path, monkeypatch, capsys, kind: str, values: Floats
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "log.csv", {"time [s]": TIME, "angle_x [arcsec]": values * 3600 / RATE})
@@ -366,7 +366,7 @@ def test_an_index_of_depth_is_not_the_time(tmp_path: Path, capsys) -> None:
     ],
 )
 def test_unit_of_time_by_the_rate_is_to_be_checked(
-    tmp_path: Path, monkeypatch, capsys, stamps: NDArray[np.float64], unit: str
+    tmp_path: Path, monkeypatch, capsys, stamps: Floats, unit: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     rows = [f"{stamp:.10f},{x}" for stamp, x in zip(stamps, GX, strict=True)]

@@ -10,9 +10,9 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gyrostab.allan.davar import davar
+from gyrostab.arrays import Floats, Ints
 from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.base import Chunk, Effect, Setup, Windows
 from gyrostab.physics.registry import make_effect
@@ -123,13 +123,13 @@ def same_whatever_the_cuts(effect: Effect, cuts: Sequence[int], **options: Any) 
 def random_cuts(seed: int, size: int, pieces: int = 5) -> list[int]:
     """Some places to cut, also single samples apart."""
     rng = np.random.default_rng(seed)
-    places: NDArray[np.int64] = np.unique(
+    places: Ints = np.unique(
         np.concatenate([rng.integers(1, size, pieces), [1, size // 2, size // 2 + 1]])
     )
     return [int(place) for place in places if 0 < place < size]
 
 
-def avar(rates: Any, rate: float, taus: Sequence[float]) -> NDArray[np.float64]:
+def avar(rates: Any, rate: float, taus: Sequence[float]) -> Floats:
     """Allan variance of every row over the whole record."""
     log = make_log(np.atleast_2d(rates), rate=rate, unit="deg/h")
     return (
@@ -144,27 +144,25 @@ def avar(rates: Any, rate: float, taus: Sequence[float]) -> NDArray[np.float64]:
     )
 
 
-def sigma(rates: Any, rate: float, taus: Sequence[float]) -> NDArray[np.float64]:
+def sigma(rates: Any, rate: float, taus: Sequence[float]) -> Floats:
     """Allan deviation of every row over the whole record."""
     return np.sqrt(avar(rates, rate, taus))
 
 
-def markov_avar(tau: Any, rms: float, time: float) -> NDArray[np.float64]:
+def markov_avar(tau: Any, rms: float, time: float) -> Floats:
     """Allan variance of a Gauss-Markov process, IEEE Std 952, annex C, with q^2 = 2 rms^2 / T_c."""
     x = np.asarray(tau, float) / time
     exact = 2.0 / x * (1.0 - (3.0 - 4.0 * np.exp(-x) + np.exp(-2.0 * x)) / (2.0 * x))
     return rms**2 * np.where(x < 1e-3, 2.0 * x / 3.0 * (1.0 - 0.75 * x), exact)
 
 
-def sinusoid_avar(tau: Any, amplitude: float, frequency: float) -> NDArray[np.float64]:
+def sinusoid_avar(tau: Any, amplitude: float, frequency: float) -> Floats:
     """Allan variance of a sinusoid, IEEE Std 952, annex C."""
     x = np.pi * frequency * np.asarray(tau, float)
     return amplitude**2 * np.sin(x) ** 4 / x**2
 
 
-def allan_of_density(
-    density: Callable[[NDArray[np.float64]], Any], tau: float, top: float
-) -> float:
+def allan_of_density(density: Callable[[Floats], Any], tau: float, top: float) -> float:
     """Integrate the Allan variance of a two-sided density (P16 Eq. 7) up to `top` [Hz]."""
     f = np.linspace(top / 400_000, top, 400_000)
     return float(
@@ -172,7 +170,7 @@ def allan_of_density(
     )
 
 
-def allan_of_samples(density: Callable[[NDArray[np.float64]], Any], k: int, rate: float) -> float:
+def allan_of_samples(density: Callable[[Floats], Any], k: int, rate: float) -> float:
     """Compute the Allan variance of samples with a two-sided density at k samples."""
     f = (np.arange(200_000) + 0.5) * (rate / 2) / 200_000
     x = np.pi * f / rate
@@ -233,7 +231,7 @@ def means_and_prediction(
     return means, predicted, design
 
 
-def band_powers(rates: Any, rate: float, edges: Any) -> NDArray[np.float64]:
+def band_powers(rates: Any, rate: float, edges: Any) -> Floats:
     """Mean two-sided density between edges [Hz], of the mean periodogram of the rows."""
     rows = np.atleast_2d(rates)
     power = (np.abs(np.fft.rfft(rows, axis=1)) ** 2 / rows.shape[1] / rate).mean(axis=0)
@@ -243,7 +241,7 @@ def band_powers(rates: Any, rate: float, edges: Any) -> NDArray[np.float64]:
 
 def said_density(
     effect: Effect, rate: float, edges: Any, parameter: str, axes: Sequence[str] = ("x",)
-) -> NDArray[np.float64]:
+) -> Floats:
     """The same as `band_powers` of the density that the effect says, by fine bands."""
     fine = [np.linspace(low, high, 60)[1:-1] for low, high in pairwise(edges)]
     return np.array(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.held_out import (
     LinearModel,
@@ -17,18 +18,18 @@ from gyrostab.diagnose.evidence.held_out import (
     noise_columns,
     with_independent_cells,
 )
-from gyrostab.diagnose.evidence.products import Array, held_out_evidence
+from gyrostab.diagnose.evidence.products import held_out_evidence
 
 
 def power_factors(
     data: xr.Dataset,
     baseline: xr.Dataset,
-    designs: Sequence[Array],
+    designs: Sequence[Floats],
     *,
     axis: str,
-    given: Array | None = None,
+    given: Floats | None = None,
     folds: xr.DataArray | None = None,
-) -> Array:
+) -> Floats:
     """Compute factors of designs in the band powers, for changes small against the spectrum.
 
     Parameters
@@ -77,7 +78,7 @@ def power_factors(
     )
 
 
-def _label_evidence(factors: Array, candidates: Mapping[str, Sequence[Array]]) -> xr.DataArray:
+def _label_evidence(factors: Floats, candidates: Mapping[str, Sequence[Floats]]) -> xr.DataArray:
     """Label the held-out evidence of candidates."""
     owner = np.repeat(np.arange(len(candidates)), [len(designs) for designs in candidates.values()])
     return xr.DataArray(
@@ -92,7 +93,7 @@ def _label_evidence(factors: Array, candidates: Mapping[str, Sequence[Array]]) -
 def mean_evidence(
     data: xr.Dataset,
     baseline: xr.Dataset,
-    candidates: Mapping[str, Sequence[Array]],
+    candidates: Mapping[str, Sequence[Floats]],
     *,
     axis: str,
     tier: Tier = "free",
@@ -121,7 +122,7 @@ def mean_evidence(
 def power_evidence(
     data: xr.Dataset,
     baseline: xr.Dataset,
-    candidates: Mapping[str, Sequence[Array]],
+    candidates: Mapping[str, Sequence[Floats]],
     *,
     axis: str,
     **more: Any,

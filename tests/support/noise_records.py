@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from gyrostab.arrays import Floats
 
 
-def white(
-    rng: np.random.Generator, trials: int, n: int, *, N: float, rate: float
-) -> NDArray[np.float64]:
+def white(rng: np.random.Generator, trials: int, n: int, *, N: float, rate: float) -> Floats:
     """Return angle random walk of N [deg/sqrt(h)] as rate [deg/h]: N sqrt(dt) of angle in dt."""
     hours = 1 / rate / 3600
     return N * np.sqrt(hours) / hours * rng.standard_normal((trials, n))
 
 
-def quantization(
-    rng: np.random.Generator, trials: int, n: int, *, Q: float, rate: float
-) -> NDArray[np.float64]:
+def quantization(rng: np.random.Generator, trials: int, n: int, *, Q: float, rate: float) -> Floats:
     """Return quantization noise of Q [urad]: an angle error at each end of a sample."""
     angle = np.degrees(Q * 1e-6) * rng.standard_normal((trials, n + 1))
     return np.diff(angle, axis=1) * rate * 3600
 
 
-def random_walk(
-    rng: np.random.Generator, trials: int, n: int, *, K: float, rate: float
-) -> NDArray[np.float64]:
+def random_walk(rng: np.random.Generator, trials: int, n: int, *, K: float, rate: float) -> Floats:
     """Rate random walk of K [deg/h^1.5]: Brownian motion averaged over each sample.
 
     The mean over an interval with increment d is the start plus d / 2 plus an independent part of
@@ -39,7 +34,7 @@ def random_walk(
     )
 
 
-def flicker(rng: np.random.Generator, trials: int, n: int, *, B: float) -> NDArray[np.float64]:
+def flicker(rng: np.random.Generator, trials: int, n: int, *, B: float) -> Floats:
     """Return bias instability of B [deg/h]: B^2 / (2 pi f), at eight times the rate, averaged."""
     out = np.empty((trials, n))
     fine = 8 * n
@@ -54,7 +49,7 @@ def flicker(rng: np.random.Generator, trials: int, n: int, *, B: float) -> NDArr
 
 def mixture(
     rng: np.random.Generator, trials: int, n: int, *, rate: float, **terms: float
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the sum of Q, N, B and K, drawn in the order in which they are given."""
     laws = {"Q": quantization, "N": white, "K": random_walk}
     x = np.zeros((trials, n))
@@ -66,9 +61,7 @@ def mixture(
     return x
 
 
-def lose(
-    rng: np.random.Generator, x: NDArray[np.float64], share: float, block: float
-) -> NDArray[np.float64]:
+def lose(rng: np.random.Generator, x: Floats, share: float, block: float) -> Floats:
     """Lose blocks of geometric length until `share` of each row is NaN."""
     for row in x:
         lost = np.count_nonzero(np.isnan(row))

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numba import njit
-from numpy.typing import NDArray
 
 from gyrostab import davar, fit_noise
+from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.kernels.compiled import INNER, KERNEL
 from gyrostab.noise import TERMS, avar_columns
 
@@ -77,23 +77,21 @@ def published_davar(
 
 
 def published_sums(
-    x: NDArray[np.float64],
+    x: Floats,
     method: str,
     window: int,
     step: int,
     n_windows: int,
-    ks: NDArray[np.int64],
+    ks: Ints,
     *,
     paper: bool = False,
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Floats, Ints]:
     """Sum and count the squared second differences of a record alone, (n_windows, n_tau)."""
     run = {"direct": _direct_sums, "recursive": _recursive_sums}[method]
     return run(*_integrate_rates(x, paper=paper), window + 1 - paper, step, n_windows, ks)
 
 
-def _integrate_rates(
-    x: NDArray[np.float64], *, paper: bool
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+def _integrate_rates(x: Floats, *, paper: bool) -> tuple[Floats, Ints, Ints]:
     """Integrate a record, with the missing samples before the first and after the last angle.
 
     A term is valid if none is missing between: with `paper`, also that of its first angle.
@@ -105,14 +103,14 @@ def _integrate_rates(
 
 
 def _direct_sums(
-    theta: NDArray[np.float64],
-    before: NDArray[np.int64],
-    after: NDArray[np.int64],
+    theta: Floats,
+    before: Ints,
+    after: Ints,
     points: int,
     step: int,
     n_windows: int,
-    ks: NDArray[np.int64],
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    ks: Ints,
+) -> tuple[Floats, Ints]:
     """Sum and count the squares of every window anew, (n_windows, n_tau)."""
     sums = np.zeros((n_windows, ks.size))
     counts = np.zeros((n_windows, ks.size), dtype=np.int64)
@@ -177,7 +175,7 @@ def fit_deviations(surface: xr.Dataset, *, terms: Iterable[str] = "QNBKR") -> xr
         if np.count_nonzero(valid) >= len(members):
             solution = np.linalg.lstsq(columns[valid] / scale, deviation[where][valid], rcond=None)
             values[where][members] = np.abs(solution[0] / scale)
-    planes: dict[str, NDArray[Any]] = {"observable": np.where(np.isfinite(values), 2, 0)}
+    planes: dict[str, Array] = {"observable": np.where(np.isfinite(values), 2, 0)}
     nothing = np.full(deviation.shape[:2], np.nan)
     for i, term in enumerate(TERMS):
         planes |= {term: values[..., i], f"{term}_stderr": nothing, f"{term}_upper": nothing}

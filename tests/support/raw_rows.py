@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from gyrostab import regularise
+from gyrostab.arrays import Floats, Ints
 from gyrostab.ingest.grid import scan_pass
 
 START = 1_773_226_800_000_000_000  # 2026-03-11T11:00:00
@@ -42,12 +43,12 @@ def raw_log(
     )
 
 
-def stamps_of(samples: ArrayLike, rate: float) -> NDArray[np.int64]:
+def stamps_of(samples: ArrayLike, rate: float) -> Ints:
     """Return the stamps of samples [ns], from the start on."""
     return START + np.rint(np.asarray(samples) * (1e9 / rate)).astype(np.int64)
 
 
-def expected(samples: ArrayLike) -> NDArray[np.float64]:
+def expected(samples: ArrayLike) -> Floats:
     """Return the signal on the grid if row i has sample ``samples[i]``, negative if dropped."""
     of = np.asarray(samples)
     out = np.full(of.max() + 1, np.nan)

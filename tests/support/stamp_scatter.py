@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from tests.support.raw_rows import START
 
 JITTER = ("normal", "uniform", "sorted", "latest", "packets", "late")
@@ -13,7 +13,7 @@ UNITS = {"ns": 1, "us": 1000, "ms": 1_000_000}
 PACKET = 7  # rows
 
 
-def lose_samples(kind: str, rows: int, random: np.random.Generator) -> NDArray[np.int64]:
+def lose_samples(kind: str, rows: int, random: np.random.Generator) -> Ints:
     """Return the true samples of about `rows` rows, with losses of the given kind."""
     if kind == "single":
         samples = np.flatnonzero(random.random(int(rows * 1.01)) >= 0.01)
@@ -29,9 +29,7 @@ def lose_samples(kind: str, rows: int, random: np.random.Generator) -> NDArray[n
     return samples - samples[0]
 
 
-def scatter_stamps(
-    samples: NDArray[np.int64], kind: str, scatter: float, random: np.random.Generator
-) -> NDArray[np.float64]:
+def scatter_stamps(samples: Ints, kind: str, scatter: float, random: np.random.Generator) -> Floats:
     """Return times of arrival [samples] with a jitter of `scatter` (half range if uniform)."""
     noise = (
         random.uniform(-scatter, scatter, len(samples))
@@ -54,6 +52,6 @@ def scatter_stamps(
     return times
 
 
-def round_stamps(times: NDArray[np.float64], rate: float, unit: str) -> NDArray[np.int64]:
+def round_stamps(times: Floats, rate: float, unit: str) -> Ints:
     """Round times of arrival to stamps [ns] in a unit."""
     return START + np.rint(times / rate * 1e9 / UNITS[unit]).astype(np.int64) * UNITS[unit]

@@ -18,15 +18,13 @@ import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 from scipy.optimize import minimize
 
+from gyrostab.arrays import Floats
 from gyrostab.blindtest.generator.noise import BANDS, floor_psd, white_level
 from gyrostab.blindtest.generator.scenario import Effect, Scenario, count_per_second
 from gyrostab.errors import OptionError
-
-Array = NDArray[np.float64]
 
 #: Log-likelihood at the limit.
 NATS = 5.7
@@ -36,7 +34,7 @@ _SPECTRUM_BANDS = 400  # of the spectrum
 _MAX_WHITE_SHARE = 2.0  # of a level; above 1 only because both are estimates
 
 
-def mean_size(scenario: Scenario, mean: Array, *, white: bool = False) -> float:
+def mean_size(scenario: Scenario, mean: Floats, *, white: bool = False) -> float:
     """Compute the size of a mean (axis, time) [deg/h] in units of the limit.
 
     It is the square root of the expected log-likelihood over `NATS`, and proportional to the
@@ -54,7 +52,7 @@ def mean_size(scenario: Scenario, mean: Array, *, white: bool = False) -> float:
     return math.sqrt(nats / NATS)
 
 
-def line_density_of(scenario: Scenario, *, axis: int) -> Array:
+def line_density_of(scenario: Scenario, *, axis: int) -> Floats:
     """Compute the two-sided noise density [(deg/h)2/Hz] of an axis at ``k rate / (2 size)``."""
     if scenario.measured is not None:
         return np.asarray(scenario.measured.lines[axis])
@@ -62,7 +60,7 @@ def line_density_of(scenario: Scenario, *, axis: int) -> Array:
     return floor_psd(f, noise=scenario.noise[axis], rate=scenario.rate)
 
 
-def band_density(scenario: Scenario) -> Array:
+def band_density(scenario: Scenario) -> Floats:
     """Compute the two-sided density [(deg/h)2/Hz] of N and Q in equal bands, shape (axis, band).
 
     For the noise of a real recording, return its typical density.
@@ -75,7 +73,7 @@ def band_density(scenario: Scenario) -> Array:
     )
 
 
-def _mean_spectra(scenario: Scenario, mean: Array) -> Iterator[tuple[int, Array, Array]]:
+def _mean_spectra(scenario: Scenario, mean: Floats) -> Iterator[tuple[int, Floats, Floats]]:
     """Yield axis number, frequencies [Hz] and recorded power [(deg/h)2/Hz] of each nonzero row."""
     present = ~scenario.missing
     for axis, values in enumerate(mean):
@@ -88,7 +86,7 @@ def _mean_spectra(scenario: Scenario, mean: Array) -> Iterator[tuple[int, Array,
         yield axis, f, recorded_share * lines**2 / scenario.rate
 
 
-def learned_nats(scenario: Scenario, mean: Array) -> float:
+def learned_nats(scenario: Scenario, mean: Floats) -> float:
     """Compute the evidence [nats] expected for a mean (axis, time) over noise fitted without it.
 
     The fit without the mean attributes a slow mean to angle random walk, bias instability and rate
@@ -111,7 +109,7 @@ def fitted_nats(scenario: Scenario, effect: Effect) -> float:
 
 
 def learned_random_nats(
-    scenario: Scenario, shares: Array, density: Callable[[Array], Array]
+    scenario: Scenario, shares: Floats, density: Callable[[Floats], Floats]
 ) -> float:
     """Compute the evidence expected for random noise over noise fitted without it [nats].
 
@@ -128,7 +126,7 @@ def learned_random_nats(
     )
 
 
-def filtered_density(scenario: Scenario, gain: Array) -> Array:
+def filtered_density(scenario: Scenario, gain: Floats) -> Floats:
     """Compute the density [(deg/h)2/Hz] (axis, frequency) of N behind a filter, and of Q.
 
     The angle is quantized after the filter. `gain` is the power gain at frequencies that divide
@@ -144,7 +142,7 @@ def filtered_density(scenario: Scenario, gain: Array) -> Array:
     )
 
 
-def learned_filter_nats(scenario: Scenario, gain: Array) -> float:
+def learned_filter_nats(scenario: Scenario, gain: Floats) -> float:
     """Compute the evidence expected for a filter over fitted white noise and Q [nats].
 
     To first order a short filter takes away what a smaller Q takes away. A filter of weight a is
@@ -160,10 +158,10 @@ def learned_filter_nats(scenario: Scenario, gain: Array) -> float:
     )
 
 
-def _filter_divergence(density: Array, term_densities: Array) -> float:
+def _filter_divergence(density: Floats, term_densities: Floats) -> float:
     """Return twice the least divergence, per sample, of two noise terms from a density [nats]."""
 
-    def apart(logarithms: Array) -> float:
+    def apart(logarithms: Floats) -> float:
         ratio = density / (np.exp(logarithms) @ term_densities)
         return float((ratio - 1 - np.log(ratio)).mean())
 
@@ -182,7 +180,7 @@ def _filter_divergence(density: Array, term_densities: Array) -> float:
 
 
 def _divergence_from_noise(
-    scenario: Scenario, axis: int, f: Array, power: Array, *, random: bool = False
+    scenario: Scenario, axis: int, f: Floats, power: Floats, *, random: bool = False
 ) -> float:
     """Compute the divergence [nats] of noise plus signal from the nearest N, B, K noise.
 
@@ -204,7 +202,7 @@ def _divergence_from_noise(
     if random:
         density, power = density + power, np.zeros_like(power)
 
-    def apart(logarithms: Array) -> float:
+    def apart(logarithms: Floats) -> float:
         ratio = density / (term_densities[0] + np.exp(logarithms) @ term_densities[1:])
         return 0.5 * float((count * (ratio * (1 + power / density) - 1 - np.log(ratio))).sum())
 
@@ -225,13 +223,13 @@ def _divergence_from_noise(
     return float(max(0.0, min(divergences)))
 
 
-def _samples_per_second(scenario: Scenario, ratio: Array) -> Array:
+def _samples_per_second(scenario: Scenario, ratio: Floats) -> Floats:
     count = count_per_second(scenario).astype(float)
     weight = count.reshape(1, -1, *(1,) * (ratio.ndim - 2))
     return weight / (ratio.shape[2] if ratio.ndim == 3 else 1)
 
 
-def variance_size(scenario: Scenario, ratio: Array) -> float:
+def variance_size(scenario: Scenario, ratio: Floats) -> float:
     """Compute the size of a change of the noise density in units of the limit.
 
     `ratio` (axis, second) or (axis, second, frequency) is the density with the effect over that
@@ -251,7 +249,7 @@ def variance_size(scenario: Scenario, ratio: Array) -> float:
     return math.sqrt(float((weight * change**2).sum()) / 4 / NATS)
 
 
-def _measured_nats(scenario: Scenario, ratio: Array) -> float:
+def _measured_nats(scenario: Scenario, ratio: Floats) -> float:
     """Compute the evidence for a temporary change of level in measured noise [nats]."""
     assert scenario.measured is not None
     if ratio.shape[1] == 1:
@@ -266,7 +264,7 @@ def _measured_nats(scenario: Scenario, ratio: Array) -> float:
     return sum(scenario.measured.change_nats(rows, axis=axis) for axis, rows in enumerate(change))
 
 
-def white_shares(scenario: Scenario) -> Array:
+def white_shares(scenario: Scenario) -> Floats:
     """Compute the share (axis, band) that white noise has of the measured level, at most 2.
 
     Behind the anti-alias filter of a logger there is less than white noise, and noise that is
@@ -277,7 +275,7 @@ def white_shares(scenario: Scenario) -> Array:
     return np.minimum(white[:, None] / scenario.measured.level, _MAX_WHITE_SHARE)
 
 
-def variance_nats(scenario: Scenario, ratio: Array, *, quiescent: bool = True) -> float:
+def variance_nats(scenario: Scenario, ratio: Floats, *, quiescent: bool = True) -> float:
     """Compute the evidence expected for a change of density over unchanged noise [nats].
 
     `ratio` is that of `variance_size`. Without `quiescent` times, which would show the
@@ -295,7 +293,7 @@ def variance_nats(scenario: Scenario, ratio: Array, *, quiescent: bool = True) -
     return float((weight * (ratio - 1 - np.log(ratio))).sum()) / 2
 
 
-def shared_size(scenario: Scenario, shares: Array, power: Array) -> float:
+def shared_size(scenario: Scenario, shares: Floats, power: Floats) -> float:
     """Compute the size of noise of one source in the white noise of the axes, of unchanged level.
 
     In known noise this is the Gaussian divergence from independent white noise. In measured noise

@@ -6,14 +6,12 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.blindtest.generator import instrument
 from gyrostab.blindtest.generator.detection_limits import NATS, NATS_PER_SAMPLE
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario
 from gyrostab.blindtest.generator.shapes import make_variance_effect, sample_sd
-
-Array = NDArray[np.float64]
 
 
 def rate_quantization(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
@@ -34,7 +32,7 @@ def rate_quantization(scenario: Scenario, rng: np.random.Generator, *, strength:
         tau=(1 / scenario.rate, 30.0),
     )
 
-    def after(record: Array) -> Array:
+    def after(record: Floats) -> Floats:
         return np.asarray((np.trunc if cut else np.rint)(record / step) * step)
 
     return replace(effect, after=after, parameters={"step": {"value": step, "unit": "deg/h"}})
@@ -48,7 +46,7 @@ def dead_zone(scenario: Scenario, rng: np.random.Generator, *, strength: float) 
         share * sample_sd(scenario, axis) * math.sqrt(math.pi / 2)
     )  # expected share of normal samples within +- width
 
-    def after(record: Array) -> Array:
+    def after(record: Floats) -> Floats:
         out = record.copy()
         out[axis] = instrument.dead_zone(
             record[axis] - np.nanmean(np.where(scenario.missing, np.nan, record[axis])), width=width
@@ -73,7 +71,7 @@ def clipping(scenario: Scenario, rng: np.random.Generator, *, strength: float) -
     number = max(1, round(NATS * strength**2 / NATS_PER_SAMPLE))
     is_two_sided, soft = bool(rng.random() < 0.5), bool(rng.random() < 0.4)
 
-    def after(record: Array) -> Array:
+    def after(record: Floats) -> Floats:
         row = record[axis]
         present = row[np.isfinite(row) & ~scenario.missing]
         below = number // 2 if is_two_sided else 0

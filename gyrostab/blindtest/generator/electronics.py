@@ -6,10 +6,10 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 from scipy.signal import lfilter
 
+from gyrostab.arrays import Floats
 from gyrostab.blindtest.generator import instrument, telemetry
 from gyrostab.blindtest.generator.detection_limits import (
     NATS,
@@ -31,8 +31,6 @@ from gyrostab.blindtest.generator.shapes import (
     sample_sd,
     scale_by_axis,
 )
-
-Array = NDArray[np.float64]
 
 _FREQUENCIES = 200 * BANDS  # of the spectrum of a source
 _MAX_SHARE = math.sqrt(0.8)  # of a source in the noise of an axis, as an amplitude
@@ -148,12 +146,12 @@ def feedback_reset(scenario: Scenario, rng: np.random.Generator, *, strength: fl
     )
 
 
-def _low_pass(frequency: Array, corner: float) -> Array:
+def _low_pass(frequency: Floats, corner: float) -> Floats:
     """Compute the power gain at frequencies, like `corner` in units of the Nyquist frequency."""
     return np.asarray(1 / (1 + (frequency / corner) ** 4))
 
 
-def _low_passed(rng: np.random.Generator, size: int, *, corner: float) -> Array:
+def _low_passed(rng: np.random.Generator, size: int, *, corner: float) -> Floats:
     frequency = np.arange(size // 2 + 1) / (size / 2)
     lines = fft.rfft(rng.standard_normal(size)) * np.sqrt(_low_pass(frequency, corner))
     common = fft.irfft(lines, size)
@@ -206,7 +204,7 @@ def logger_filter(scenario: Scenario, rng: np.random.Generator, *, strength: flo
     """Draw an undocumented short smoothing filter in the logger."""
     kind = str(rng.choice(["three", "pole", "mean"]))
 
-    def taps(a: float) -> Array:
+    def taps(a: float) -> Floats:
         a = min(a, 0.45)
         return {
             "three": np.array([a / 2, 1 - a, a / 2]),
@@ -217,11 +215,11 @@ def logger_filter(scenario: Scenario, rng: np.random.Generator, *, strength: flo
     f = (np.arange(200) + 0.5) / 200 * math.pi
     unfiltered = filtered_density(scenario, np.ones(f.size))
 
-    def power_gain(a: float) -> Array:
+    def power_gain(a: float) -> Floats:
         response = np.exp(-1j * f[:, None] * np.arange(taps(a).size)) @ taps(a)
         return np.asarray(np.maximum(np.abs(response) ** 2, 1e-12))
 
-    def ratio(a: float) -> Array:
+    def ratio(a: float) -> Floats:
         change = filtered_density(scenario, power_gain(a)) / unfiltered
         mean = np.exp(np.log(change).mean(axis=1, keepdims=True))
         return np.asarray((change / mean)[:, None, :])  # the level before the filter is unknown
@@ -242,7 +240,7 @@ def logger_filter(scenario: Scenario, rng: np.random.Generator, *, strength: flo
     )
     weights = taps(amplitude)
 
-    def after(record: Array) -> Array:
+    def after(record: Floats) -> Floats:
         first = record[:, :1]
         return np.asarray(first + lfilter(weights, [weights.sum()], record - first, axis=1))
 
@@ -269,7 +267,7 @@ def spikes(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> 
     lsb = sd * math.sqrt(2 * worth) / 2**12
     seed = int(rng.integers(2**31))
 
-    def after(record: Array) -> Array:
+    def after(record: Floats) -> Floats:
         out = record.copy()
         gone = np.where(scenario.missing, np.nan, record[axis])
         flipped, where = telemetry.flip_bits(

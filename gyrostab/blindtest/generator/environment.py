@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-Array = NDArray[np.float64]
+from gyrostab.arrays import Bools, Floats
 
 
-def lag(values: Array, tau: float, *, dt: float = 1.0) -> Array:
+def lag(values: Floats, tau: float, *, dt: float = 1.0) -> Floats:
     """Apply a first-order lag `tau` [s] to values every `dt` [s], starting in equilibrium.
 
     Examples
@@ -25,7 +24,7 @@ def lag(values: Array, tau: float, *, dt: float = 1.0) -> Array:
     return np.asarray(values[0] + lfilter([1 - keep], [1, -keep], np.asarray(values) - values[0]))
 
 
-def temperature(rng: np.random.Generator, seconds: float, *, still: bool = False) -> Array:
+def temperature(rng: np.random.Generator, seconds: float, *, still: bool = False) -> Floats:
     """Draw the temperature of the housing [degC], one value a second: ramps, plateaus, reversals.
 
     If `still`, there is only a slow wander.
@@ -59,7 +58,7 @@ def temperature(rng: np.random.Generator, seconds: float, *, still: bool = False
 
 def shaking(
     rng: np.random.Generator, seconds: float, *, bursts: int, longest: float = 600.0
-) -> tuple[Array, NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """Draw the rms acceleration [g], one value a second, and the mask of its bursts.
 
     Each of the bursts has a separate level, and is at most `longest` [s].
@@ -90,7 +89,7 @@ def shaking(
     return np.asarray(level), busy
 
 
-def supply(rng: np.random.Generator, seconds: float, *, load: Array) -> Array:
+def supply(rng: np.random.Generator, seconds: float, *, load: Floats) -> Floats:
     """Draw the battery voltage [V], one value a second; it sags with time and `load` (0 to 1).
 
     Examples
@@ -108,7 +107,7 @@ def supply(rng: np.random.Generator, seconds: float, *, load: Array) -> Array:
     return np.asarray(rng.uniform(26, 30) - sag + lag(steps, 3.0) - rng.uniform(0.1, 0.5) * load)
 
 
-def light_monitor(rng: np.random.Generator, seconds: float, *, dips: bool) -> Array:
+def light_monitor(rng: np.random.Generator, seconds: float, *, dips: bool) -> Floats:
     """Draw the relative light power, one value a second: slow loss, and `dips` of connectors.
 
     Examples
@@ -130,14 +129,14 @@ def light_monitor(rng: np.random.Generator, seconds: float, *, dips: bool) -> Ar
 
 def read_sensor(
     rng: np.random.Generator,
-    values: Array,
+    values: Floats,
     *,
     noise: float = 0.0,
     relative: float = 0.0,
     lsb: float = 0.0,
     tau: float = 0.0,
     dt: float = 1.0,
-) -> Array:
+) -> Floats:
     """Apply a sensor to `values`: lag `tau` [s], additive and relative noise, steps of `lsb`.
 
     Examples

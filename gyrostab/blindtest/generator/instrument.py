@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 from scipy.constants import Boltzmann, elementary_charge
 
-Array = NDArray[np.float64]
+from gyrostab.arrays import Floats
 
 # ------------------------------------------------------------------------------------------------
 # heat conduction in a quadrupole-wound fiber coil on an insulated spool
@@ -25,7 +24,7 @@ def diffusion_time(thickness: float, diffusivity: float) -> float:
 
 def _discretise_diffusion(
     layers: int, thickness: float, diffusivity: float, dt: float
-) -> tuple[Array, Array]:
+) -> tuple[Floats, Floats]:
     """Compute P, q of ``T' = P T + q (u + u') / 2`` (Crank-Nicolson; face temperature u)."""
     h = thickness / layers
     a = diffusivity / h**2
@@ -39,13 +38,13 @@ def _discretise_diffusion(
 
 
 def layer_temperatures(
-    face: Array,
+    face: Floats,
     *,
     dt: float,
     layers: int = 24,
     thickness: float = 0.012,
     diffusivity: float = 2.2e-7,
-) -> Array:
+) -> Floats:
     """Compute the temperature (layer, time) from that of the outer face (time,) every `dt` [s].
 
     The coil starts in thermal equilibrium. Its layers lie between face and spool; `thickness` [m]
@@ -65,7 +64,7 @@ def layer_temperatures(
     return np.asarray(vectors @ modes + face[0])
 
 
-def layer_weights(layers: int, *, trim: float = 0.0, scatter: Array | None = None) -> Array:
+def layer_weights(layers: int, *, trim: float = 0.0, scatter: Floats | None = None) -> Floats:
     """Compute the weight ``integral of (L - 2 l) dl`` [m2] of each layer of a quadrupole winding.
 
     The fiber has the length `LENGTH`, and the winding a multiple of 4 layers. `trim` is the offset
@@ -93,7 +92,7 @@ def layer_weights(layers: int, *, trim: float = 0.0, scatter: Array | None = Non
 RESPONSIVITY, LOAD_TEMPERATURE = 0.9, 300.0
 
 
-def detector_psd(power: Array, *, load: float = 50e3, rin: float = 1e-12) -> dict[str, Array]:
+def detector_psd(power: Floats, *, load: float = 50e3, rin: float = 1e-12) -> dict[str, Floats]:
     """Compute the one-sided densities [A2/Hz] of the current of a detector under `power` [W].
 
     `load` is its resistance [ohm], and `rin` the relative intensity noise of the source [1/Hz],
@@ -107,7 +106,7 @@ def detector_psd(power: Array, *, load: float = 50e3, rin: float = 1e-12) -> dic
     }
 
 
-def relative_psd(power: Array, *, depth: float = 0.75 * math.pi, **detector: float) -> Array:
+def relative_psd(power: Floats, *, depth: float = 0.75 * math.pi, **detector: float) -> Floats:
     """Compute the one-sided phase noise [rad2/Hz] of an interferometer biased at `depth` [rad].
 
     The signal is ``P (1 + cos(phase))``: its slope is ``P sin(depth)``, and the light at the
@@ -120,14 +119,14 @@ def relative_psd(power: Array, *, depth: float = 0.75 * math.pi, **detector: flo
 
 
 def loss_db(
-    temperature: Array,
-    hours: Array,
+    temperature: Floats,
+    hours: Floats,
     *,
     per_kelvin: float,
     curvature: float = 0.0,
     per_hour: float = 0.0,
     power: float = 1.0,
-) -> Array:
+) -> Floats:
     """Compute the loss of light [dB] from temperature [degC], relative to 40 degC, and age [h].
 
     Examples
@@ -148,18 +147,18 @@ def loss_db(
 _DIAMETER, _INDEX, _WAVELENGTH = 0.04, 1.45, 1.55e-6
 
 
-def reset_frequency(rate: Array) -> Array:
+def reset_frequency(rate: Floats) -> Floats:
     """Compute the reset frequency [Hz] at a rotation rate [deg/h]: ``D w / (n lambda)``."""
     return np.asarray(_DIAMETER * np.radians(np.asarray(rate) / 3600.0) / (_INDEX * _WAVELENGTH))
 
 
-def ramp_phase(rate: Array, *, dt: float, first: float = 0.0) -> Array:
+def ramp_phase(rate: Floats, *, dt: float, first: float = 0.0) -> Floats:
     """Compute the phase of the ramp, 0 to 1 between resets, from rates [deg/h] every `dt` [s]."""
     turned = first + np.cumsum(reset_frequency(rate)) * dt
     return np.asarray(turned % 1.0)
 
 
-def reset_error(phase: Array, *, settle: float = 0.05) -> Array:
+def reset_error(phase: Floats, *, settle: float = 0.05) -> Floats:
     """Compute the normalised rate error after a reset that differs from 2 pi; its mean is zero.
 
     The loop removes the error over the share `settle` of the ramp.
@@ -174,7 +173,7 @@ def reset_error(phase: Array, *, settle: float = 0.05) -> Array:
     return np.asarray(np.exp(-np.asarray(phase) / settle) - mean)
 
 
-def dead_zone(rate: Array, *, width: float) -> Array:
+def dead_zone(rate: Floats, *, width: float) -> Floats:
     """Apply a dead zone: crosstalk holds the output at zero below `width` [deg/h]."""
     rate = np.asarray(rate, dtype=float)
     above = np.sqrt(np.maximum(rate**2 - width**2, 0.0))
@@ -188,18 +187,18 @@ def dead_zone(rate: Array, *, width: float) -> Array:
 FAST_HZ = 4000.0
 
 
-def _design_bandpass(low: float, high: float) -> Array:
+def _design_bandpass(low: float, high: float) -> Floats:
     return np.asarray(signal.butter(2, [low, high], btype="bandpass", fs=FAST_HZ, output="sos"))
 
 
-def _filtered_variance(sos: Array, low: float) -> float:
+def _filtered_variance(sos: Floats, low: float) -> float:
     """Compute the variance of filtered white noise of unit variance."""
     f = np.geomspace(low / 30, FAST_HZ / 2 - 1e-6, 4000)
     gain = np.abs(signal.freqz_sos(sos, worN=f, fs=FAST_HZ)[1]) ** 2
     return float(np.trapezoid(gain, f)) / (FAST_HZ / 2)
 
 
-def band_noise(rng: np.random.Generator, size: int, *, low: float, high: float) -> Array:
+def band_noise(rng: np.random.Generator, size: int, *, low: float, high: float) -> Floats:
     """Draw acceleration of unit rms between two frequencies [Hz], `size` samples at `FAST_HZ`."""
     sos = _design_bandpass(low, high)
     settle = round(2 * FAST_HZ / low)
@@ -207,7 +206,7 @@ def band_noise(rng: np.random.Generator, size: int, *, low: float, high: float) 
     return np.asarray(x / math.sqrt(_filtered_variance(sos, low)))
 
 
-def mount_filter(resonance: float, *, quality: float) -> tuple[Array, Array]:
+def mount_filter(resonance: float, *, quality: float) -> tuple[Floats, Floats]:
     """Design the filter (b, a) at `FAST_HZ` of a damped mount with a `resonance` [Hz]."""
     w = 2 * math.pi * resonance
     warped = 2 * FAST_HZ * math.tan(w / (2 * FAST_HZ))
@@ -216,7 +215,7 @@ def mount_filter(resonance: float, *, quality: float) -> tuple[Array, Array]:
     return np.asarray(b), np.asarray(a)
 
 
-def decimator_taps(rate: float, kind: str) -> Array:
+def decimator_taps(rate: float, kind: str) -> Floats:
     """Compute the weights, of sum 1, of the decimator from `FAST_HZ` to its divisor `rate` [Hz].
 
     Kinds are "point" (every n-th value), "dump" (integrate and dump), "cic2" (two of these in
@@ -232,7 +231,7 @@ def decimator_taps(rate: float, kind: str) -> Array:
     return box if kind == "dump" else np.convolve(box, box)
 
 
-def decimate(x: Array, *, rate: float, kind: str) -> Array:
+def decimate(x: Floats, *, rate: float, kind: str) -> Floats:
     """Decimate `x` from `FAST_HZ` to `rate` [Hz] like the logger."""
     factor = round(FAST_HZ / rate)
     smooth = signal.oaconvolve(x, decimator_taps(rate, kind))[: x.size]
@@ -240,14 +239,14 @@ def decimate(x: Array, *, rate: float, kind: str) -> Array:
 
 
 def folded_psd(
-    frequency: Array,
+    frequency: Floats,
     *,
     rate: float,
     kind: str,
     low: float,
     high: float,
-    mount: tuple[Array, Array] | None = None,
-) -> Array:
+    mount: tuple[Floats, Floats] | None = None,
+) -> Floats:
     """Compute the aliased two-sided density [1/Hz] of unit-rms band noise after the decimator."""
     sos = _design_bandpass(low, high)
     level = 1.0 / (FAST_HZ * _filtered_variance(sos, low))
@@ -265,7 +264,7 @@ def folded_psd(
     return np.asarray(level * gain.reshape(alias.shape).sum(axis=0))
 
 
-def rectify(rms: Array, *, exponent: float, saturation: float) -> Array:
+def rectify(rms: Floats, *, exponent: float, saturation: float) -> Floats:
     """Compute the shift of the mean by vibration `rms` [g], with exponent and saturation [g]."""
     rms = np.asarray(rms, dtype=float)
     return np.asarray(rms**exponent / (1.0 + (rms / saturation) ** exponent))
@@ -280,7 +279,7 @@ EARTH_RATE = 15.041
 
 def rotation(
     rng: np.random.Generator, seconds: float, *, dt: float, fastest: float = 120.0
-) -> Array:
+) -> Floats:
     """Draw the rotation rate [deg/s], every `dt` [s], of a tool that alternately drills and rests.
 
     In some intervals stick-slip makes the rate oscillate at 0.1-0.5 Hz. The highest speed `fastest`
@@ -310,7 +309,7 @@ def rotation(
     return rate
 
 
-def toolface(rotation_rate: Array, *, dt: float, first: float = 0.0) -> Array:
+def toolface(rotation_rate: Floats, *, dt: float, first: float = 0.0) -> Floats:
     """Integrate rotation rates [deg/s] every `dt` [s] to the toolface [rad] by the trapezoid rule.
 
     Examples
@@ -322,12 +321,12 @@ def toolface(rotation_rate: Array, *, dt: float, first: float = 0.0) -> Array:
     return np.asarray(first + np.concatenate([[0.0], np.cumsum(0.5 * (w[1:] + w[:-1]) * dt)]))
 
 
-def cross_axis(angle: Array, *, across: float) -> tuple[Array, Array]:
+def cross_axis(angle: Floats, *, across: float) -> tuple[Floats, Floats]:
     """Project a fixed vector of size `across` on the rotating axes x and y."""
     return np.asarray(across * np.cos(angle)), np.asarray(-across * np.sin(angle))
 
 
-def gravity(angle: Array, *, inclination: float) -> tuple[Array, Array, Array]:
+def gravity(angle: Floats, *, inclination: float) -> tuple[Floats, Floats, Floats]:
     """Compute gravity [g] along x, y, z of a tool at an `inclination` [deg] from vertical."""
     x, y = cross_axis(angle, across=math.sin(math.radians(inclination)))
     return x, y, np.full(np.shape(angle), math.cos(math.radians(inclination)))

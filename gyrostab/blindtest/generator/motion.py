@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.blindtest.generator import instrument, telemetry
 from gyrostab.blindtest.generator.detection_limits import band_density, learned_nats
 from gyrostab.blindtest.generator.noise import BANDS, white_level
@@ -27,8 +27,6 @@ from gyrostab.blindtest.generator.shapes import (
     make_variance_effect,
     scale_by_axis,
 )
-
-Array = NDArray[np.float64]
 
 
 def vibration_rectification(
@@ -57,9 +55,9 @@ def _shake_axis(
     share: float,
     *,
     band: tuple[float, float],
-    mount: tuple[Array, Array],
+    mount: tuple[Floats, Floats],
     kind: str,
-) -> Array:
+) -> Floats:
     """Draw the logged angular vibration of one axis (time,) for 1 deg/h per g of rms."""
     out = np.zeros(scenario.size)
     for begin, end in telemetry.list_spans(scenario.busy).tolist() if share else []:
@@ -89,7 +87,7 @@ def _make_shaking_noise(
     strength: float,
     in_band: bool,
     band: tuple[float, float],
-    mount: tuple[Array, Array],
+    mount: tuple[Floats, Floats],
     kind: str,
     form: str,
 ) -> Effect:
@@ -171,7 +169,7 @@ def aliased_vibration(scenario: Scenario, rng: np.random.Generator, *, strength:
     )
 
 
-def _draw_toolface(scenario: Scenario, rng: np.random.Generator) -> Array:
+def _draw_toolface(scenario: Scenario, rng: np.random.Generator) -> Floats:
     """Draw the toolface at the samples [rad]."""
     return to_samples(
         scenario,
@@ -187,7 +185,7 @@ def _rotation_tau(scenario: Scenario) -> tuple[float, float]:
     return max(1 / scenario.rate, 0.1 / fast), 3.0 / fast
 
 
-def _is_turning(scenario: Scenario) -> NDArray[np.bool_]:
+def _is_turning(scenario: Scenario) -> Bools:
     return np.asarray(
         np.interp(
             np.arange(scenario.temperature.size),

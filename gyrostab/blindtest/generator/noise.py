@@ -12,13 +12,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, signal, special
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import nnls
 from scipy.signal import lfilter
 
-Array = NDArray[np.float64]
+from gyrostab.arrays import Floats
 
 URAD = math.degrees(1e-6) * 3600.0  # urad -> deg/h s
 
@@ -51,7 +50,7 @@ def white_level(n: float) -> float:
     return 60.0 * n
 
 
-def floor_psd(frequency: Array, *, noise: dict[str, float], rate: float) -> Array:
+def floor_psd(frequency: Floats, *, noise: dict[str, float], rate: float) -> Floats:
     """Compute the two-sided density [(deg/h)2/Hz] of N, B, K, Q [urad] at frequencies > 0 [Hz]."""
     f = np.asarray(frequency, dtype=float)
     q = noise.get("Q", 0.0) * URAD
@@ -65,7 +64,7 @@ def floor_psd(frequency: Array, *, noise: dict[str, float], rate: float) -> Arra
 
 def flicker(
     rng: np.random.Generator, size: int, *, b: float, rate: float, method: str = "spectrum"
-) -> Array:
+) -> Floats:
     """Draw bias instability `b` [deg/h] from its "spectrum", or as a sum of many "relaxations"."""
     if b == 0:
         return np.zeros(size)
@@ -92,12 +91,12 @@ def flicker(
     return total
 
 
-def random_walk(rng: np.random.Generator, size: int, *, k: float, rate: float) -> Array:
+def random_walk(rng: np.random.Generator, size: int, *, k: float, rate: float) -> Floats:
     """Draw a rate random walk `k` [deg/h^1.5] that starts at 0."""
     return np.asarray(np.cumsum(rng.standard_normal(size)) * k / math.sqrt(3600.0 * rate))
 
 
-def quantize_angle(values: Array, *, q: float, rate: float, first: float = 0.0) -> Array:
+def quantize_angle(values: Floats, *, q: float, rate: float, first: float = 0.0) -> Floats:
     """Quantize rates (time,) [deg/h] like an angle counter: they become differences of steps.
 
     `q` is the coefficient Q [urad], the step of the angle over root 12, and `first` the initial
@@ -117,15 +116,15 @@ class MeasuredNoise:
     rate: float  # sampling rate [Hz]
     #: (axis, line): two-sided density [(deg/h)2/Hz] at the frequencies ``k rate / (2 size)``, k
     #: from 1.
-    lines: Array
-    level: Array  # (axis, band): typical density in `BANDS` bands [(deg/h)2/Hz]
+    lines: Floats
+    level: Floats  # (axis, band): typical density in `BANDS` bands [(deg/h)2/Hz]
     #: (axis, block, band): logarithm of the density near each block over `level`; NaN where too
     #: much is missing.
-    log_power: Array
+    log_power: Floats
     block: int  # samples of a block
-    outlier_sigma: Array  # (axis,): standard deviation that a single outlier must exceed [deg/h]
+    outlier_sigma: Floats  # (axis,): standard deviation that a single outlier must exceed [deg/h]
 
-    def blocks(self, values: Array) -> Array:
+    def blocks(self, values: Floats) -> Floats:
         """Average values (..., second, band) over blocks; the first starts half a block late."""
         number, seconds = self.log_power.shape[1], values.shape[-2]
         sample = np.arange(number * self.block)
@@ -133,7 +132,7 @@ class MeasuredNoise:
         share = np.bincount(sample // self.block * seconds + second, minlength=number * seconds)
         return np.asarray(share.reshape(number, seconds) / self.block @ values)
 
-    def change_nats(self, change: Array, *, axis: int) -> float:
+    def change_nats(self, change: Floats, *, axis: int) -> float:
         """Compute the evidence [nats] for a known change of level against its fluctuation.
 
         `change` (block, band) is that of the logarithm of the density. The bands have the weights
@@ -154,7 +153,7 @@ class MeasuredNoise:
         return 0.5 * float((fft.dct(size, norm="ortho")[1:] ** 2 / rate / density).sum())
 
 
-def line_density(values: Array, *, rate: float) -> Array:
+def line_density(values: Floats, *, rate: float) -> Floats:
     """Compute the two-sided density [unit2/Hz] of values (time,) at ``k rate / (2 size)``, k >= 1.
 
     The ratio of each line to a fitted slope (white, flicker and random walk) is averaged over 33
@@ -169,7 +168,7 @@ def line_density(values: Array, *, rate: float) -> Array:
     )
 
 
-def _fit_slope(lines: Array) -> Callable[[Array], Array]:
+def _fit_slope(lines: Floats) -> Callable[[Floats], Floats]:
     """Fit white, flicker and random walk to the first lines by Whittle's likelihood."""
     level = float(np.median(lines)) / math.log(2.0) + 1e-300
     power, shapes = lines / level, _slope_terms(np.arange(1.0, lines.size + 1))
@@ -178,7 +177,7 @@ def _fit_slope(lines: Array) -> Callable[[Array], Array]:
     return lambda k: level * (_slope_terms(k) @ best)
 
 
-def _fit_from_start(power: Array, shapes: Array, size: Array) -> Array:
+def _fit_from_start(power: Floats, shapes: Floats, size: Floats) -> Floats:
     """Fit non-negative sizes of terms to powers by Fisher scoring with step halving."""
     density = shapes @ size
     misfit = _minus_log_likelihood(power, density)
@@ -198,17 +197,17 @@ def _fit_from_start(power: Array, shapes: Array, size: Array) -> Array:
     return size
 
 
-def _slope_terms(number: Array) -> Array:
+def _slope_terms(number: Floats) -> Floats:
     """Compute white, flicker and random walk (line, term) at line numbers."""
     return np.asarray(number[:, None] ** -np.arange(3.0))
 
 
-def _minus_log_likelihood(power: Array, density: Array) -> float:
+def _minus_log_likelihood(power: Floats, density: Floats) -> float:
     """Compute minus the logarithm of Whittle's likelihood."""
     return float((np.log(density) + power / density).sum())
 
 
-def _block_powers(values: Array, *, rate: float, block: int) -> Array:
+def _block_powers(values: Floats, *, rate: float, block: int) -> Floats:
     """Compute the two-sided density (block, band) [unit2/Hz] in Hann windows of two blocks."""
     cut = np.lib.stride_tricks.sliding_window_view(values, 2 * block)[::block]
     present = np.isfinite(cut)
@@ -225,7 +224,7 @@ def _block_powers(values: Array, *, rate: float, block: int) -> Array:
     )
 
 
-def _outlier_sigma(values: Array, lines: Array, *, rate: float) -> float:
+def _outlier_sigma(values: Floats, lines: Floats, *, rate: float) -> float:
     """Compute the standard deviation for one outlier, from whitened noise and its extreme."""
     present = np.isfinite(values)
     white = fft.dct(np.where(present, values - values[present].mean(), 0.0), norm="ortho")
@@ -236,7 +235,7 @@ def _outlier_sigma(values: Array, lines: Array, *, rate: float) -> float:
     return max(1.0, wildest / math.sqrt(2.0 * math.log(values.size))) / math.sqrt(worth)
 
 
-def measure_noise(record: Array, *, rate: float, axes: int | None = None) -> MeasuredNoise:
+def measure_noise(record: Floats, *, rate: float, axes: int | None = None) -> MeasuredNoise:
     """Measure the noise of a real record (axis, time) [deg/h], NaN where lost, at a rate [Hz].
 
     Axes that the record lacks of the number `axes` repeat the first.

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.blindtest.generator import instrument, telemetry
 from gyrostab.blindtest.generator import noise as floor
 from gyrostab.blindtest.generator.environment import read_sensor
@@ -24,8 +24,6 @@ from gyrostab.blindtest.generator.scenario import (
 from gyrostab.ingest import gap_variables
 from gyrostab.schema import check_log
 from gyrostab.time.grid import time_coordinate
-
-Array = NDArray[np.float64]
 
 #: Channel -> unit in memory.
 UNITS = {
@@ -43,7 +41,7 @@ UNITS = {
 
 def draw_base_noise(
     scenario: Scenario, rng: np.random.Generator, effects: Sequence[Effect] = ()
-) -> Array:
+) -> Floats:
     """Draw the base noise (axis, time) [deg/h], with the white noise that the effects imply."""
     rows = []
     for i, noise in enumerate(scenario.noise):
@@ -64,7 +62,7 @@ def draw_base_noise(
     return np.stack(rows)
 
 
-def make_record(scenario: Scenario, effects: Sequence[Effect], *, seed: int) -> Array:
+def make_record(scenario: Scenario, effects: Sequence[Effect], *, seed: int) -> Floats:
     """Make the rates (axis, time) [deg/h]; for one seed the noise is the same without effects."""
     record = draw_base_noise(scenario, stream(seed, "noise"), effects) + stream(
         seed, "level"
@@ -90,7 +88,7 @@ def make_record(scenario: Scenario, effects: Sequence[Effect], *, seed: int) -> 
     return record
 
 
-def find_missing(scenario: Scenario, effects: Sequence[Effect]) -> NDArray[np.bool_]:
+def find_missing(scenario: Scenario, effects: Sequence[Effect]) -> Bools:
     """Mark the missing samples."""
     gone = scenario.missing.copy()
     for effect in effects:
@@ -101,14 +99,14 @@ def find_missing(scenario: Scenario, effects: Sequence[Effect]) -> NDArray[np.bo
 
 def make_channels(
     scenario: Scenario, effects: Sequence[Effect], rng: np.random.Generator
-) -> dict[str, tuple[Array, float]]:
+) -> dict[str, tuple[Floats, float]]:
     """Make the channels as their sensors report them: name to values and rate [Hz].
 
     Temperature and vibration are always present. Other channels are present at random, independent
     of the effects, and where an effect needs one.
     """
     needed = {effect.driver for effect in effects}
-    out: dict[str, tuple[Array, float]] = {
+    out: dict[str, tuple[Floats, float]] = {
         "temperature": (
             read_sensor(rng, scenario.temperature, noise=0.03, lsb=0.0625, tau=rng.uniform(0, 20)),
             1.0,
@@ -146,7 +144,7 @@ def make_channels(
     return out
 
 
-def make_gap_variables(missing: NDArray[np.bool_], *, start: int, rate: float) -> dict[str, Any]:
+def make_gap_variables(missing: Bools, *, start: int, rate: float) -> dict[str, Any]:
     """Make the gap table of a log from the missing samples."""
     edges = telemetry.list_spans(missing)
     length, none = edges[:, 1] - edges[:, 0], np.zeros(len(edges), dtype=np.int64)
@@ -154,7 +152,7 @@ def make_gap_variables(missing: NDArray[np.bool_], *, start: int, rate: float) -
 
 
 def make_log(
-    record: Array, channels: dict[str, tuple[Array, float]], *, start: int, rate: float
+    record: Floats, channels: dict[str, tuple[Floats, float]], *, start: int, rate: float
 ) -> xr.Dataset:
     """Make a log from rates (axis, time) [deg/h] and channels; it holds only instrument data.
 
@@ -182,7 +180,7 @@ def make_log(
 
 
 def add_channels(
-    log: xr.Dataset, channels: dict[str, tuple[Array, float]], *, start: int, rate: float
+    log: xr.Dataset, channels: dict[str, tuple[Floats, float]], *, start: int, rate: float
 ) -> xr.Dataset:
     """Add the channels of `make_channels` to a log, slower ones with a separate time coordinate."""
     for name, (values, channel_rate) in channels.items():

@@ -9,12 +9,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.blindtest.generator import environment, instrument, telemetry
 from gyrostab.blindtest.generator.noise import URAD, MeasuredNoise
-
-Array = NDArray[np.float64]
 
 AXES = ("x", "y", "z")
 
@@ -48,14 +46,14 @@ class Scenario:
     size: int
     start: int
     noise: tuple[dict[str, float], ...]
-    temperature: Array
-    vibration: Array
-    busy: NDArray[np.bool_]
-    rotation: Array
-    supply: Array
-    light: Array
-    cuts: Array
-    missing: NDArray[np.bool_]
+    temperature: Floats
+    vibration: Floats
+    busy: Bools
+    rotation: Floats
+    supply: Floats
+    light: Floats
+    cuts: Floats
+    missing: Bools
     flicker: str = "spectrum"
     measured: MeasuredNoise | None = None
 
@@ -89,14 +87,14 @@ class Effect:
     driver: str | None = None
     strength: float = 0.0
     learned_nats: float | None = None
-    active: NDArray[np.bool_] | None = None
-    mean: Array | None = None
-    variance: Array | None = None
-    extra: Array | None = None
-    common: Array | None = None
-    after: Callable[[Array], Array] | None = None
-    ramp: Array | None = None
-    lost: NDArray[np.bool_] | None = None
+    active: Bools | None = None
+    mean: Floats | None = None
+    variance: Floats | None = None
+    extra: Floats | None = None
+    common: Floats | None = None
+    after: Callable[[Floats], Floats] | None = None
+    ramp: Floats | None = None
+    lost: Bools | None = None
     parameters: dict[str, Any] = field(default_factory=dict)
     also_accepted: tuple[str, ...] = ()
 
@@ -113,12 +111,12 @@ def stream(seed: int, *names: str | int) -> np.random.Generator:
     return np.random.default_rng([seed, *(zlib.crc32(label.encode()) for label in labels)])
 
 
-def to_samples(scenario: Scenario, values: Array, *, dt: float = 1.0) -> Array:
+def to_samples(scenario: Scenario, values: Floats, *, dt: float = 1.0) -> Floats:
     """Interpolate values every `dt` [s] linearly to the samples of the log."""
     return np.interp(np.arange(scenario.size) / scenario.rate, np.arange(values.size) * dt, values)
 
 
-def count_per_second(scenario: Scenario) -> NDArray[np.int64]:
+def count_per_second(scenario: Scenario) -> Ints:
     """Count the samples present in every second, shape (second,)."""
     at = (np.flatnonzero(~scenario.missing) / scenario.rate).astype(np.int64)
     return np.bincount(at, minlength=scenario.temperature.size)
@@ -149,8 +147,8 @@ def _draw_noise(
 
 
 def _draw_missing(
-    rng: np.random.Generator, size: int, rate: float, gaps: float, cuts: Array
-) -> NDArray[np.bool_]:
+    rng: np.random.Generator, size: int, rate: float, gaps: float, cuts: Floats
+) -> Bools:
     frame = max(1, int(rng.uniform(0.2, 4.0) * rate))
     lost = telemetry.draw_losses(
         rng, size, share=gaps, frame=frame, burst=1.0 if rng.random() < 0.4 else rng.uniform(3, 30)

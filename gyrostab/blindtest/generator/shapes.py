@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 from scipy.optimize import minimize_scalar
 
+from gyrostab.arrays import Floats
 from gyrostab.blindtest.generator.detection_limits import (
     NATS,
     amplitude_for,
@@ -23,11 +23,10 @@ from gyrostab.blindtest.generator.environment import lag
 from gyrostab.blindtest.generator.noise import white_level
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
 
-Array = NDArray[np.float64]
 _MIN_LAG_S, _LAG_COUNT = 1.0, 24
 
 
-def draw_shares(rng: np.random.Generator, *, single_probability: float = 0.6) -> Array:
+def draw_shares(rng: np.random.Generator, *, single_probability: float = 0.6) -> Floats:
     """Draw signed shares (axis,): one axis with `single_probability`, else all, unequally."""
     shares = rng.choice([-1.0, 1.0], 3) * rng.uniform(0.4, 1.0, 3)
     if rng.random() < single_probability:
@@ -37,19 +36,19 @@ def draw_shares(rng: np.random.Generator, *, single_probability: float = 0.6) ->
     return np.asarray(shares / np.abs(shares).max())
 
 
-def axes_with_share(shares: Array) -> tuple[str, ...]:
+def axes_with_share(shares: Floats) -> tuple[str, ...]:
     """List the names of the axes with a nonzero share."""
     return tuple(axis for axis, share in zip(AXES, shares, strict=True) if share != 0)
 
 
-def scale_by_axis(shares: Array, value: float) -> dict[str, float]:
+def scale_by_axis(shares: Floats, value: float) -> dict[str, float]:
     """Multiply `value` by the share of every axis with a nonzero share."""
     return {
         axis: float(value * share) for axis, share in zip(AXES, shares, strict=True) if share != 0
     }
 
 
-def signed_peaks(effect: Effect, shares: Array) -> dict[str, float]:
+def signed_peaks(effect: Effect, shares: Floats) -> dict[str, float]:
     """Find the largest mean of every axis with a nonzero share [deg/h], with the share's sign."""
     assert effect.mean is not None
     return {
@@ -70,7 +69,7 @@ def sample_sd(scenario: Scenario, axis: int) -> float:
 
 
 def fit_lagged_driver(
-    scenario: Scenario, mean: Array, driver: Array, *, axis: int
+    scenario: Scenario, mean: Floats, driver: Floats, *, axis: int
 ) -> tuple[float, float]:
     """Fit a first-order response to a driver (second,) to a mean (time,): sensitivity, lag [s].
 
@@ -93,7 +92,7 @@ def fit_lagged_driver(
 
 
 def _fit_driver(
-    scenario: Scenario, mean: Array, driver: Array, *, axis: int
+    scenario: Scenario, mean: Floats, driver: Floats, *, axis: int
 ) -> tuple[float, float]:
     """Fit a driver (time,) to a mean (time,); return the sensitivity and the unexplained share."""
     present = ~scenario.missing
@@ -108,14 +107,14 @@ def _fit_driver(
 
 def make_mean_effect(
     scenario: Scenario,
-    shape: Array,
-    shares: Array,
+    shape: Floats,
+    shares: Floats,
     *,
     strength: float,
     form_differs: bool,
     tau: tuple[float, float] | None = None,
     parameters: Mapping[str, Any] | None = None,
-    regressor: tuple[str, Array, str] | None = None,
+    regressor: tuple[str, Floats, str] | None = None,
     unless: tuple[str, ...] = (),
     **description: Any,
 ) -> Effect:
@@ -157,7 +156,7 @@ def make_mean_effect(
 
 def make_variance_effect(
     scenario: Scenario,
-    ratio: Callable[[float], Array],
+    ratio: Callable[[float], Floats],
     *,
     strength: float,
     first: float,

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gyrostab.arrays import Bools, Floats, Ints
 
 #: Shortest power cut [s]; telemetry losses are shorter where an effect depends on restarts.
 MIN_POWER_CUT_S = 6.0
@@ -15,7 +14,7 @@ MIN_POWER_CUT_S = 6.0
 
 def draw_losses(
     rng: np.random.Generator, size: int, *, share: float, frame: int, burst: float = 1.0
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Draw which of `size` samples are lost, in whole frames and bursts of frames.
 
     `share`, below 1, is the mean share lost, `frame` the samples of a frame, and `burst` the mean
@@ -36,12 +35,12 @@ def draw_losses(
     return np.asarray(np.repeat(bad, frame)[:size])
 
 
-def list_spans(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+def list_spans(mask: Bools) -> Ints:
     """List the first index and one past the last of every run in a mask, shape (run, 2)."""
     return np.flatnonzero(np.diff(mask, prepend=False, append=False)).reshape(-1, 2)
 
 
-def limit_losses(lost: NDArray[np.bool_], *, longest: int) -> NDArray[np.bool_]:
+def limit_losses(lost: Bools, *, longest: int) -> Bools:
     """Split losses longer than `longest` samples by restoring short pieces.
 
     Examples
@@ -58,7 +57,7 @@ def limit_losses(lost: NDArray[np.bool_], *, longest: int) -> NDArray[np.bool_]:
     return out
 
 
-def draw_power_cuts(rng: np.random.Generator, seconds: float, *, number: int) -> Array:
+def draw_power_cuts(rng: np.random.Generator, seconds: float, *, number: int) -> Floats:
     """Draw begin and end [s] of `number` power cuts, spread over the record, shape (number, 2).
 
     Examples
@@ -73,7 +72,7 @@ def draw_power_cuts(rng: np.random.Generator, seconds: float, *, number: int) ->
     return np.stack([begin, begin + off], axis=1)
 
 
-def mark_power_cuts(cuts: Array, size: int, rate: float) -> NDArray[np.bool_]:
+def mark_power_cuts(cuts: Floats, size: int, rate: float) -> Bools:
     """Mark the samples without power, shape (size,)."""
     t = np.arange(size) / rate
     off = np.zeros(size, dtype=bool)
@@ -83,8 +82,8 @@ def mark_power_cuts(cuts: Array, size: int, rate: float) -> NDArray[np.bool_]:
 
 
 def flip_bits(
-    rng: np.random.Generator, values: Array, *, number: int, lsb: float, bit: int
-) -> tuple[Array, NDArray[np.int64]]:
+    rng: np.random.Generator, values: Floats, *, number: int, lsb: float, bit: int
+) -> tuple[Floats, Ints]:
     """Flip one bit in `number` samples of two's complement code in steps of `lsb`.
 
     Bit 0 is the lowest; a flip changes a sample by ``lsb * 2**bit``. Return the samples after the
@@ -104,9 +103,7 @@ def flip_bits(
     return after, where
 
 
-def choose_frames(
-    rng: np.random.Generator, missing: NDArray[np.bool_], *, number: int, frame: int
-) -> NDArray[np.int64]:
+def choose_frames(rng: np.random.Generator, missing: Bools, *, number: int, frame: int) -> Ints:
     """Choose at most `number` frames of `frame` samples that are complete, like the one before.
 
     At most one frame in eight is chosen. Return the first sample of each.
@@ -123,7 +120,7 @@ def choose_frames(
     return np.sort(chosen) * frame
 
 
-def repeat_frames(values: Array, starts: NDArray[np.int64], *, frame: int, hold: bool) -> Array:
+def repeat_frames(values: Floats, starts: Ints, *, frame: int, hold: bool) -> Floats:
     """Overwrite frames of values (axis, time), at their first samples `starts`, by earlier values.
 
     They repeat the previous frame, or if `hold`, its last sample.

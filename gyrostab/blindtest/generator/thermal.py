@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.blindtest.generator import instrument
 from gyrostab.blindtest.generator.environment import lag
 from gyrostab.blindtest.generator.scenario import Effect, Scenario, to_samples
@@ -17,8 +17,6 @@ from gyrostab.blindtest.generator.shapes import (
     make_variance_effect,
     signed_peaks,
 )
-
-Array = NDArray[np.float64]
 
 
 def shupe(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
@@ -70,7 +68,7 @@ def temperature_bias(scenario: Scenario, rng: np.random.Generator, *, strength: 
     )
 
 
-def _apply_dead_band(values: Array, width: float) -> Array:
+def _apply_dead_band(values: Floats, width: float) -> Floats:
     out = np.empty_like(values)
     last = values[0]
     for i, value in enumerate(values):
@@ -106,7 +104,7 @@ def thermal_hysteresis(scenario: Scenario, rng: np.random.Generator, *, strength
     return effect
 
 
-def _since_power_on(scenario: Scenario) -> Array:
+def _since_power_on(scenario: Scenario) -> Floats:
     """Compute the time since the last power-on [s], one value a second."""
     t = np.arange(scenario.temperature.size, dtype=float)
     since = t.copy()
@@ -150,7 +148,7 @@ def _make_light_noise(
     rng: np.random.Generator,
     *,
     strength: float,
-    loss: Array,
+    loss: Floats,
     **description: Any,
 ) -> Effect:
     """Make a noise effect from a scalable `loss` of light [dB] by the budget of the detector."""
@@ -159,7 +157,7 @@ def _make_light_noise(
     budget = {"rin": 10 ** rng.uniform(-13.5, -12.3)}
     nominal = instrument.relative_psd(np.array([power]), **budget)[0]
 
-    def ratio(amplitude: float) -> Array:
+    def ratio(amplitude: float) -> Floats:
         drop = np.clip(amplitude * shares[:, None] * loss[None, :], -20, 20)
         return np.asarray(instrument.relative_psd(power * 10 ** (-drop / 10), **budget) / nominal)
 

@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from gyrostab.arrays import Floats
 from gyrostab.blindtest.generator.detection_limits import (
     NATS,
     amplitude_for,
@@ -18,11 +18,9 @@ from gyrostab.blindtest.generator.noise import floor_psd
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
 from gyrostab.blindtest.generator.shapes import axes_with_share, draw_shares, make_mean_effect
 
-Array = NDArray[np.float64]
-
 
 def wander_size(
-    scenario: Scenario, shares: Array, *, time: float, rms: float
+    scenario: Scenario, shares: Floats, *, time: float, rms: float
 ) -> tuple[float, float]:
     """Compute size (in units of the limit) and evidence [nats] of a random bias.
 
@@ -44,7 +42,7 @@ def wander_size(
     return math.sqrt(size / 4 / NATS), nats
 
 
-def _lorentz_density(f: Array, time: float) -> Array:
+def _lorentz_density(f: Floats, time: float) -> Floats:
     """Return the two-sided density [1/Hz] of a bias of unit variance."""
     return 2 * time / (1 + (2 * math.pi * f * time) ** 2)
 
@@ -52,7 +50,7 @@ def _lorentz_density(f: Array, time: float) -> Array:
 def _make_random_bias(
     scenario: Scenario,
     rng: np.random.Generator,
-    waveform: Array,
+    waveform: Floats,
     *,
     strength: float,
     time: float,

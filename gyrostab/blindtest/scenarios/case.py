@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.blindtest.generator import environment, telemetry
 from gyrostab.blindtest.generator.catalogue import CATALOGUE, OUT_OF_CATALOGUE, Entry
 from gyrostab.blindtest.generator.detection_limits import fitted_nats
@@ -25,8 +25,7 @@ from gyrostab.errors import FormatError, OptionError
 from gyrostab.store.output import replace_file, write_text
 from gyrostab.units import on_disk
 
-Array = NDArray[np.float64]
-Channels = dict[str, tuple[Array, float]]
+Channels = dict[str, tuple[Floats, float]]
 
 #: Length of the block means of a waveform in the truth [s].
 WAVEFORM_BLOCK_S = 10.0
@@ -37,7 +36,7 @@ _MAX_TRIES = 40
 _TRIES_PER_STRENGTH = 10
 
 
-def _make_substitute(driver: str, values: Array, rng: np.random.Generator) -> tuple[str, Array]:
+def _make_substitute(driver: str, values: Floats, rng: np.random.Generator) -> tuple[str, Floats]:
     """Make a channel of another name that moves like `values`, with some independent wander."""
     wander = np.cumsum(rng.standard_normal(values.size))
     parts = [(part - part.mean()) / (float(part.std()) or 1.0) for part in (values, wander)]
@@ -125,7 +124,7 @@ def draw_suitable(plan: dict[str, Any], entries: Sequence[Entry], attempt: int) 
     )
 
 
-def _shorten_losses(scenario: Scenario) -> NDArray[np.bool_]:
+def _shorten_losses(scenario: Scenario) -> Bools:
     """Shorten telemetry losses so that they cannot be mistaken for a power cut."""
     off = telemetry.mark_power_cuts(scenario.cuts, scenario.size, scenario.rate)
     longest = max(1, round((telemetry.MIN_POWER_CUT_S - 2.0) * scenario.rate))
@@ -210,7 +209,7 @@ def _format_time(scenario: Scenario, second: float) -> str:
     return str(np.datetime_as_string(stamp, unit="ms"))
 
 
-def _list_intervals(scenario: Scenario, active: NDArray[np.bool_] | None) -> list[list[str]]:
+def _list_intervals(scenario: Scenario, active: Bools | None) -> list[list[str]]:
     """List the ISO 8601 intervals in which an effect is active; without a mask the whole record."""
     if active is None:
         return [[_format_time(scenario, 0.0), _format_time(scenario, scenario.seconds)]]
@@ -220,7 +219,7 @@ def _list_intervals(scenario: Scenario, active: NDArray[np.bool_] | None) -> lis
     ]
 
 
-def _block_means(scenario: Scenario, values: NDArray[np.float64]) -> list[float]:
+def _block_means(scenario: Scenario, values: Floats) -> list[float]:
     length = round(WAVEFORM_BLOCK_S * scenario.rate)
     padded_size = math.ceil(values.size / length) * length
     padded = np.concatenate([values, np.full(padded_size - values.size, np.nan)]).reshape(

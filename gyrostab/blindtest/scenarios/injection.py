@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy import fft
 
+from gyrostab.arrays import Floats
 from gyrostab.blindtest.generator.catalogue import CATALOGUE
 from gyrostab.blindtest.generator.detection_limits import white_shares
 from gyrostab.blindtest.generator.noise import BANDS, MeasuredNoise, measure_noise, white_level
@@ -29,8 +29,6 @@ from gyrostab.blindtest.scenarios.case import describe_truth
 from gyrostab.blindtest.scoring.baseline_detectors import allan_variance, octaves
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.time.grid import first_stamp
-
-Array = NDArray[np.float64]
 
 _MAX_TRIES = 60
 _EQUAL_RANGE_SHARE = 1e-9  # difference of equal values
@@ -97,7 +95,7 @@ _THREE_AXIS_EFFECTS = (*_ONE_AXIS_EFFECTS, "shared_source", "earth_rate", "scale
 _STRENGTHS = (3.0, 5.0, 5.0, 8.0)
 
 
-def estimate_noise(record: Array, *, rate: float) -> dict[str, float]:
+def estimate_noise(record: Floats, *, rate: float) -> dict[str, float]:
     """Estimate N and K of a real axis (time,) [deg/h] roughly, from its Allan variance.
 
     Examples
@@ -121,7 +119,7 @@ def estimate_noise(record: Array, *, rate: float) -> dict[str, float]:
 
 
 def _draw_around_log(
-    log: xr.Dataset, record: Array, measured: MeasuredNoise, rng: np.random.Generator
+    log: xr.Dataset, record: Floats, measured: MeasuredNoise, rng: np.random.Generator
 ) -> Scenario:
     """Draw a scenario with the length, gaps and noise of a real log."""
     rate = float(log.attrs["sampling_rate_hz"])
@@ -139,7 +137,7 @@ def _draw_around_log(
     )
 
 
-def _compute_addition(scenario: Scenario, effect: Effect, rng: np.random.Generator) -> Array:
+def _compute_addition(scenario: Scenario, effect: Effect, rng: np.random.Generator) -> Floats:
     """Compute what an effect adds (3, time); noise cannot be removed from a real record."""
     total = np.zeros((3, scenario.size))
     for part in (effect.mean, effect.extra):
@@ -156,7 +154,7 @@ def _compute_addition(scenario: Scenario, effect: Effect, rng: np.random.Generat
     return total + _filter_like_record(scenario, added)
 
 
-def _filter_like_record(scenario: Scenario, noise: Array) -> Array:
+def _filter_like_record(scenario: Scenario, noise: Floats) -> Floats:
     """Remove from white noise (axis, time) what the logger's filter removed from the record."""
     assert scenario.measured is not None
     level = scenario.measured.level
@@ -167,7 +165,7 @@ def _filter_like_record(scenario: Scenario, noise: Array) -> Array:
     return np.asarray(fft.irfft(lines * np.sqrt(response[:, band]), noise.shape[1], axis=1))
 
 
-def quantization_step(values: Array) -> float:
+def quantization_step(values: Floats) -> float:
     """Find the quantization step of values (time,); 0 where they are not quantized.
 
     Examples
@@ -192,7 +190,7 @@ def quantization_step(values: Array) -> float:
     return step if np.abs(gaps / step - np.rint(gaps / step)).max() < _MAX_STEP_ERROR else 0.0
 
 
-def _quantize_like(record: Array, values: Array, dither: Array) -> Array:
+def _quantize_like(record: Floats, values: Floats, dither: Floats) -> Floats:
     """Round values (axis, time) down to the steps of a record, after adding a dither in steps.
 
     Steps are counted from the value nearest to zero, so that zeros remain exact.
@@ -274,7 +272,7 @@ def _rename_axes(truth: dict[str, Any], names: Mapping[str, str]) -> dict[str, A
 
 
 def _draw_effect(
-    log: xr.Dataset, record: Array, effect: str, strength: float, rng: np.random.Generator
+    log: xr.Dataset, record: Floats, effect: str, strength: float, rng: np.random.Generator
 ) -> tuple[Scenario, Effect]:
     entry = CATALOGUE[effect]
     present = set("xyz"[: record.shape[0]])
@@ -292,7 +290,7 @@ def _draw_effect(
 
 
 def _replace_record(
-    log: xr.Dataset, record: Array, channels: dict[str, tuple[Array, float]], scenario: Scenario
+    log: xr.Dataset, record: Floats, channels: dict[str, tuple[Floats, float]], scenario: Scenario
 ) -> xr.Dataset:
     gone = np.asarray(np.isnan(record).all(axis=0))
     out = log.isel(axis=slice(0, record.shape[0])).drop_dims("gap", errors="ignore")

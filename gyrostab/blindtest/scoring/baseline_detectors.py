@@ -11,14 +11,12 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy import special
 
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.blindtest.generator import noise as floor
 from gyrostab.blindtest.generator.noise import white_level
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario
-
-Array = NDArray[np.float64]
 
 #: Level of both detectors.
 LEVEL = 0.01
@@ -48,9 +46,7 @@ def octaves(size: int) -> list[int]:
     return [2**k for k in range(largest.bit_length())]
 
 
-def allan_variance(
-    values: Array, factors: list[int], *, counts: NDArray[np.int64] | None = None
-) -> Array:
+def allan_variance(values: Floats, factors: list[int], *, counts: Ints | None = None) -> Floats:
     """Compute the overlapping Allan variance [(deg/h)2] of rates (time,) with NaN.
 
     Averaging times are `factors` [samples]. Clusters must be half full; the variance is NaN where
@@ -73,7 +69,7 @@ def allan_variance(
     return np.asarray(out)
 
 
-def _block_means(values: Array) -> tuple[Array, NDArray[np.int64]]:
+def _block_means(values: Floats) -> tuple[Floats, Ints]:
     """Average blocks of `_BLOCK_SAMPLES`; return the means and the samples present in each."""
     cut = values[: values.size // _BLOCK_SAMPLES * _BLOCK_SAMPLES].reshape(-1, _BLOCK_SAMPLES)
     counts = np.isfinite(cut).sum(axis=1)
@@ -81,7 +77,7 @@ def _block_means(values: Array) -> tuple[Array, NDArray[np.int64]]:
     return means, counts
 
 
-def log_allan(values: Array) -> Array:
+def log_allan(values: Floats) -> Floats:
     """Compute the log Allan variance of rates at `octaves`, long times from block means."""
     factors = octaves(values.size)
     if values.size <= _LONG_RECORD_SAMPLES:
@@ -96,11 +92,11 @@ def log_allan(values: Array) -> Array:
 
 def _draw_null(
     rng: np.random.Generator,
-    missing: NDArray[np.bool_],
+    missing: Bools,
     noise: dict[str, float],
     rate: float,
     flicker: str,
-) -> Array:
+) -> Floats:
     size = missing.size
     record = floor.white_level(noise["N"]) * math.sqrt(rate) * rng.standard_normal(size) + 7.0
     record += floor.flicker(rng, size, b=noise["B"], rate=rate, method=flicker) + floor.random_walk(
@@ -113,12 +109,12 @@ def _draw_null(
 
 def _draw_null_curves(
     rng: np.random.Generator,
-    missing: NDArray[np.bool_],
+    missing: Bools,
     noise: dict[str, float],
     rate: float,
     flicker: str,
     nulls: int,
-) -> tuple[Array, Array]:
+) -> tuple[Floats, Floats]:
     """Draw log Allan variances (null, factor), and the ratio of the record's scatter to theirs.
 
     For a long record, short times come from nulls of a part, long times from nulls of means.
@@ -160,7 +156,7 @@ def allan_band(
     *,
     noise: dict[str, float],
     rate: float,
-    missing: NDArray[np.bool_],
+    missing: Bools,
     rng: np.random.Generator,
     nulls: int = 60,
     flicker: str = "spectrum",
@@ -189,14 +185,14 @@ def allan_band(
     }
 
 
-def band_excess(values: Array, band: dict[str, Any]) -> float:
+def band_excess(values: Floats, band: dict[str, Any]) -> float:
     """Compute the largest deviation of the Allan variance from an `allan_band` [sigma]."""
     z = (log_allan(values)[band["keep"]] - band["mean"]) / band["sd"]
     return float(np.nanmax(np.abs(z)))
 
 
 def allan_detector(
-    record: Array, truth: dict[str, Any], *, rng: np.random.Generator, nulls: int = 60
+    record: Floats, truth: dict[str, Any], *, rng: np.random.Generator, nulls: int = 60
 ) -> float:
     """Compute how far the Allan deviation of any axis is outside its band of noise [sigma].
 
@@ -224,7 +220,7 @@ def _shared_limit(limit: float, axes: int) -> float:
     return float(-special.ndtri(tail / 2))
 
 
-def block_series(log: xr.Dataset, length: int) -> tuple[Array, Array, NDArray[np.int64]]:
+def block_series(log: xr.Dataset, length: int) -> tuple[Floats, Floats, Ints]:
     """Compute block means and block log-variances (axis, block), and the samples present in each.
 
     An incomplete last block is left out. Blocks that are less than a quarter full count as empty.
@@ -239,7 +235,7 @@ def block_series(log: xr.Dataset, length: int) -> tuple[Array, Array, NDArray[np
     return mean, power, np.where(count > max(2, length // 4), count, 0)
 
 
-def channel_means(log: xr.Dataset, length: int, number: int) -> dict[str, Array]:
+def channel_means(log: xr.Dataset, length: int, number: int) -> dict[str, Floats]:
     """Average each channel of a log over `number` blocks of `length` samples of the gyro."""
     out = {}
     for name, variable in log.data_vars.items():
@@ -270,7 +266,7 @@ def channel_detector(log: xr.Dataset) -> float:
     return math.log(LEVEL / len(p_values) / max(min(p_values), 1e-300)) if p_values else -math.inf
 
 
-def _correlation_p(x: Array, y: Array) -> float:
+def _correlation_p(x: Floats, y: Floats) -> float:
     good = np.isfinite(x) & np.isfinite(y)
     n = int(good.sum())
     if n < 5 or np.ptp(x[good]) == 0 or np.ptp(y[good]) == 0:
@@ -312,7 +308,7 @@ def trace_visibility(scenario: Scenario, effect: Effect) -> dict[str, float]:
 def find_visibility(
     scenario: Scenario,
     effects: Sequence[Effect],
-    record: Array,
+    record: Floats,
     *,
     rng: np.random.Generator,
 ) -> dict[str, Any]:

@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.blindtest.generator.catalogue import merge_ambiguous
 from gyrostab.blindtest.scoring.proportions import make_lines, resample
 from gyrostab.blindtest.scoring.score import CATALOGUE_KINDS, answered_rows, drawn_rows, first_rows
 from gyrostab.blindtest.scoring.table import CLEAR_STRENGTH
 
 Row = Mapping[str, Any]
-Array = NDArray[np.float64]
 
 #: Shares of records of noise that each detector may call a detection.
 FALSE_ALARM_RATES = (0.02, 0.05)
@@ -32,7 +31,7 @@ _NAMED_STRENGTH, _STRENGTH_TOLERANCE = 5.0, 1e-3
 
 def _list_comparisons(
     rows: Sequence[Row],
-) -> list[tuple[dict[str, Any], list[Row], Array, NDArray[np.bool_]]]:
+) -> list[tuple[dict[str, Any], list[Row], Floats, Bools]]:
     """List group and detector, records of noise and cases, their scores, and which are cases."""
     noise = answered_rows([row for row in rows if row["kind"] in ("null", "counterpart")])
     out = []
@@ -50,7 +49,7 @@ def _list_comparisons(
     return out
 
 
-def _share_detected(scores: Array, is_case: NDArray[np.bool_], rate: float) -> float:
+def _share_detected(scores: Floats, is_case: Bools, rate: float) -> float:
     """Compute the share of cases above the score that at most `rate` of the noise exceeds."""
     noise, cases = np.sort(scores[~is_case]), scores[is_case]
     if not noise.size or not cases.size:
@@ -60,7 +59,7 @@ def _share_detected(scores: Array, is_case: NDArray[np.bool_], rate: float) -> f
 
 
 def _share_columns(
-    records: Sequence[Row], scores: Array, is_case: NDArray[np.bool_], rate: float
+    records: Sequence[Row], scores: Floats, is_case: Bools, rate: float
 ) -> dict[str, float]:
     def share(chosen: Any) -> float:
         return _share_detected(scores[chosen], is_case[chosen], rate)

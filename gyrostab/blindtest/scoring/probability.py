@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.blindtest.scoring.proportions import (
     Line,
     make_line,
@@ -19,7 +20,6 @@ from gyrostab.blindtest.scoring.proportions import (
 from gyrostab.blindtest.scoring.score import drawn_rows, first_rows
 
 Row = Mapping[str, Any]
-Array = NDArray[np.float64]
 
 _GROUPS = 5  # of about equal size, in the curve and in the calibration error
 _DRAWS = 1000  # of the outcomes of exact probabilities
@@ -28,7 +28,7 @@ _SEED = 0  # of these draws
 _INTERVAL = (0.025, 0.975)
 
 
-def _collect_probabilities(rows: Sequence[Row]) -> tuple[list[Row], Array, Array]:
+def _collect_probabilities(rows: Sequence[Row]) -> tuple[list[Row], Floats, Floats]:
     """Return each identification, its probability, and 1 where its name is right."""
     entries: list[Row] = [
         {**identification, "index": row["index"]}
@@ -41,7 +41,7 @@ def _collect_probabilities(rows: Sequence[Row]) -> tuple[list[Row], Array, Array
     return entries, stated, right
 
 
-def _split_groups(stated: Array) -> list[NDArray[np.intp]]:
+def _split_groups(stated: Floats) -> list[NDArray[np.intp]]:
     """Split identifications into groups of about equal size; equal probabilities stay together."""
     from scipy.stats import rankdata
 
@@ -49,7 +49,7 @@ def _split_groups(stated: Array) -> list[NDArray[np.intp]]:
     return [np.flatnonzero(number == group) for group in np.unique(number)]
 
 
-def expected_calibration_error(stated: Array, right: Array) -> float:
+def expected_calibration_error(stated: Floats, right: Floats) -> float:
     """Compute the mean distance of stated probability and share that is right, over groups.
 
     Examples
@@ -125,7 +125,7 @@ def probability_lines(rows: Sequence[Row]) -> list[Line]:
     A sample of exact probabilities has a calibration error too; a line gives its mean.
     """
     entries, stated, right = _collect_probabilities(rows)
-    scores: dict[str, tuple[Callable[[Array, Array], float], str]] = {
+    scores: dict[str, tuple[Callable[[Floats, Floats], float], str]] = {
         "probability of a name: expected calibration error": (
             expected_calibration_error,
             "<= 0.05",
@@ -142,7 +142,7 @@ def probability_lines(rows: Sequence[Row]) -> list[Line]:
             make_line(exact, *nothing, ""),
         ]
 
-    def score_line(name: str, score: Callable[[Array, Array], float], target: str) -> Line:
+    def score_line(name: str, score: Callable[[Floats, Floats], float], target: str) -> Line:
         ends = resample(entries, lambda chosen: score(stated[chosen], right[chosen]))
         return make_line(name, score(stated, right), *ends, stated.size, target)
 
@@ -157,14 +157,14 @@ def probability_lines(rows: Sequence[Row]) -> list[Line]:
     ]
 
 
-def _brier_score(stated: Array, right: Array) -> float:
+def _brier_score(stated: Floats, right: Floats) -> float:
     return float(np.mean((stated - right) ** 2))
 
 
-def _constant_brier_score(stated: Array, right: Array) -> float:
+def _constant_brier_score(stated: Floats, right: Floats) -> float:
     return _brier_score(np.full(stated.size, right.mean()), right)
 
 
-def _log_score(stated: Array, right: Array) -> float:
+def _log_score(stated: Floats, right: Floats) -> float:
     of_outcome = np.maximum(np.where(right > 0.0, stated, 1.0 - stated), _LEAST_PROBABILITY)
     return float(-np.log(of_outcome).mean())

@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from gyrostab.arrays import Array, Complexes, Floats
 from gyrostab.errors import GyrostabError
 from gyrostab.time.stamps import to_nanoseconds
 
-Array = NDArray[np.float64]
 _RECORDS = 8  # simulated with and without effects; limits time
 _SEGMENTS = 32  # of a record, for statistics that change over time
 _MEANS = 1024  # of a record, from which differences of all lengths are taken
@@ -70,7 +69,7 @@ def check_model(
     }
 
 
-def simulate_statistics(log: xr.Dataset, model: Any) -> list[dict[str, Array]]:
+def simulate_statistics(log: xr.Dataset, model: Any) -> list[dict[str, Floats]]:
     """Compute the statistics of records simulated from a model like a recording.
 
     They have the stamps, channels and lost samples of the recording, and no noise on axes that the
@@ -89,7 +88,7 @@ def simulate_statistics(log: xr.Dataset, model: Any) -> list[dict[str, Array]]:
     return statistics
 
 
-def measure_statistics(log: xr.Dataset) -> dict[str, Array]:
+def measure_statistics(log: xr.Dataset) -> dict[str, Floats]:
     """Compute the statistics of a recording."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -97,9 +96,9 @@ def measure_statistics(log: xr.Dataset) -> dict[str, Array]:
 
 
 def likelihood_ratio(
-    recorded: Mapping[str, Array],
-    with_effects: list[dict[str, Array]],
-    without: list[dict[str, Array]],
+    recorded: Mapping[str, Floats],
+    with_effects: list[dict[str, Floats]],
+    without: list[dict[str, Floats]],
 ) -> float:
     """Return the log-likelihood ratio of statistics under two ensembles of simulated records.
 
@@ -122,7 +121,7 @@ def likelihood_ratio(
     return total
 
 
-def _fit_scatter(ensemble: Array) -> float:
+def _fit_scatter(ensemble: Floats) -> float:
     """Return the scale of Student's law of new values about the medians of an ensemble.
 
     It is the most likely one. Mean and variance would be far too large for most values where a few
@@ -139,13 +138,13 @@ def _fit_scatter(ensemble: Array) -> float:
     return float(np.sqrt(scale))
 
 
-def record_statistics(rate: Array, log: xr.Dataset) -> dict[str, Array]:
+def record_statistics(rate: Floats, log: xr.Dataset) -> dict[str, Floats]:
     """Compute the statistics of a record (axis, time), in groups of equal scatter.
 
     Differences of means at all lengths, powers in octaves over time, the mean spectrum, coherencies
     of axes, sample counts, and the coupling to the phase of a ramp, to rotation and to channels.
     """
-    out: dict[str, Array] = {}
+    out: dict[str, Floats] = {}
     hertz = float(log.attrs["sampling_rate_hz"])
     channels = _channels_at_samples(log)
     for row, values in enumerate(rate):
@@ -167,13 +166,13 @@ def record_statistics(rate: Array, log: xr.Dataset) -> dict[str, Array]:
     return out
 
 
-def _cut_segments(values: Array, count: int) -> Array:
+def _cut_segments(values: Floats, count: int) -> Floats:
     """Return (segment, sample), without the last samples."""
     size = max(values.size // count, 1)
     return values[: size * (values.size // size)][: size * count].reshape(-1, size)
 
 
-def _mean_differences(values: Array) -> dict[str, Array]:
+def _mean_differences(values: Floats) -> dict[str, Floats]:
     """Return differences of adjacent means, by the number of means; across gaps where they are."""
     segments = _cut_segments(values, min(_MEANS, max(values.size // 16, 2)))
     count = np.isfinite(segments).sum(axis=1)
@@ -186,7 +185,7 @@ def _mean_differences(values: Array) -> dict[str, Array]:
     return out
 
 
-def _segment_spectra(values: Array, count: int) -> NDArray[np.complex128]:
+def _segment_spectra(values: Floats, count: int) -> Complexes:
     """Return the spectra of tapered segments (segment, frequency); missing samples are 0."""
     segments = _cut_segments(values, count)
     centred = np.nan_to_num(segments - np.nanmean(segments, axis=1, keepdims=True))
@@ -199,7 +198,7 @@ def _list_octaves(size: int) -> list[tuple[int, int]]:
     return list(pairwise(edges[edges > 0].tolist()))
 
 
-def _octave_powers(values: Array) -> dict[str, Array]:
+def _octave_powers(values: Floats) -> dict[str, Floats]:
     """Return log powers of segments, by octave."""
     power = np.abs(_segment_spectra(values, _SEGMENTS)) ** 2
     with np.errstate(divide="ignore"):
@@ -209,7 +208,7 @@ def _octave_powers(values: Array) -> dict[str, Array]:
         }
 
 
-def _measure_coherencies(spectrum: NDArray[Any], other_spectrum: NDArray[Any]) -> Array:
+def _measure_coherencies(spectrum: Array, other_spectrum: Array) -> Floats:
     """Return real and imaginary coherency of two axes by octave, in standard deviations."""
     out = []
     for low, high in _list_octaves(spectrum.shape[1]):
@@ -219,7 +218,7 @@ def _measure_coherencies(spectrum: NDArray[Any], other_spectrum: NDArray[Any]) -
     return np.array([part for number in out for part in (number.real, number.imag)])
 
 
-def _sample_counts(values: Array) -> dict[str, Array]:
+def _sample_counts(values: Floats) -> dict[str, Floats]:
     """Return roots of counts: zeros, repeats, range ends, outliers, copies; log number of levels.
 
     With them, the logarithm of the largest departure of a sample from its neighbours.
@@ -244,7 +243,7 @@ def _sample_counts(values: Array) -> dict[str, Array]:
     }
 
 
-def _measure_outliers(values: Array) -> tuple[int, float]:
+def _measure_outliers(values: Floats) -> tuple[int, float]:
     """Count samples that depart from the median of their neighbours by more than chance allows.
 
     Normal noise has one such sample in a record. Returned with the count is the logarithm of the
@@ -260,8 +259,8 @@ def _measure_outliers(values: Array) -> tuple[int, float]:
 
 
 def _channel_couplings(
-    values: Array, channels: Mapping[str, Array], hertz: float
-) -> dict[str, Array]:
+    values: Floats, channels: Mapping[str, Floats], hertz: float
+) -> dict[str, Floats]:
     """Return the coupling to ramp, rotation, and sample by sample to other channels."""
     out = {}
     centred = values - np.nanmean(values)
@@ -289,7 +288,7 @@ def _channel_couplings(
     return out
 
 
-def _channels_at_samples(log: xr.Dataset) -> dict[str, Array]:
+def _channels_at_samples(log: xr.Dataset) -> dict[str, Floats]:
     """Return the channels with a value for each sample of the rate, whatever their stamps."""
     from gyrostab.schema import log_channels
 

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.blindtest.scoring.baseline_detectors import block_series, channel_means
-
-Array = NDArray[np.float64]
 
 _BLOCKS = 300  # in a long record
 _LEAST_SAMPLES = 16  # in a block, if none is missing
@@ -22,7 +20,7 @@ _WALK_RATIOS = (0.0, *np.geomspace(1e-5, 10.0, 13))
 _LAGS = (0.02, 0.1)  # time constants of lagged channels and of decays, share of the record
 
 
-def _make_terms(channels: dict[str, Array], number: int) -> tuple[Array, Array]:
+def _make_terms(channels: dict[str, Floats], number: int) -> tuple[Floats, Floats]:
     """Make all terms (block, term): forms of each channel, courses in time, change points.
 
     The cost of a term is the logarithm of the number of terms of its sort, and that of two sorts.
@@ -39,14 +37,14 @@ def _make_terms(channels: dict[str, Array], number: int) -> tuple[Array, Array]:
     return np.column_stack([*terms, steps]), costs
 
 
-def _lag_values(values: Array, blocks: float) -> Array:
+def _lag_values(values: Floats, blocks: float) -> Floats:
     from scipy.signal import lfilter
 
     keep = math.exp(-1.0 / blocks)
     return np.asarray(lfilter([1.0 - keep], [1.0, -keep], values, zi=[keep * values[0]])[0])
 
 
-def _whiten_differences(columns: Array, variance: Array, walk: Array) -> tuple[Array, float]:
+def _whiten_differences(columns: Floats, variance: Floats, walk: Floats) -> tuple[Floats, float]:
     """Whiten differences of blocks (block, column) in white noise and random walk.
 
     `variance` (block) is that of the white noise, `walk` (difference) that of the steps between.
@@ -63,10 +61,10 @@ def _whiten_differences(columns: Array, variance: Array, walk: Array) -> tuple[A
 
 
 def _gain_of_terms(
-    series: Array,
-    counts: NDArray[np.int64],
-    terms: Array,
-    costs: Array,
+    series: Floats,
+    counts: Ints,
+    terms: Floats,
+    costs: Floats,
     walk_ratios: Sequence[float],
 ) -> float:
     """Compute the largest gain in log likelihood, less the cost, of one to `_MAX_TERMS` terms.
@@ -89,7 +87,7 @@ def _gain_of_terms(
     return float((best[1:] - best[0] - term_cost * np.arange(1, _MAX_TERMS + 1)).max())
 
 
-def _select_terms(white: Array, costs: Array) -> Array:
+def _select_terms(white: Floats, costs: Floats) -> Floats:
     """Regress the first column on the others step by step; return log likelihood less costs."""
     residual, candidates = white[:, 0].copy(), white[:, 1:].copy()
     half = 0.5 * white.shape[0]

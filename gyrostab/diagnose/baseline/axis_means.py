@@ -6,14 +6,13 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import Bounds, OptimizeResult, minimize
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.evidence.products import marginalise, mean_products, scale_columns
 from gyrostab.diagnose.evidence.wandering import RandomProcesses
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
 #: K and B are tried up to this multiple of the scatter of neighbouring means. Design choice: far
 #: above, because too low a limit makes a bias or angle noise of what is their noise.
 MAX_SCATTER = 3.0
@@ -28,14 +27,14 @@ _PRIOR_PRECISION = 1e-9  # of effects in the means, over that of one mean; nearl
 class AxisMeans(NamedTuple):
     """Block means of an axis, and what they are explained by next to flicker and random walk."""
 
-    values: Array  # (block, 1): means [degree hour-1]; anything where not present
-    effects: Array | None  # (block, column): designs of effects of any size
-    variance: Array  # (block,): their white variance [degree2 hour-2]
+    values: Floats  # (block, 1): means [degree hour-1]; anything where not present
+    effects: Floats | None  # (block, column): designs of effects of any size
+    variance: Floats  # (block,): their white variance [degree2 hour-2]
     step: float  # length of a block [s]
-    present: NDArray[np.bool_]  # (block,)
+    present: Bools  # (block,)
     wander: RandomProcesses
 
-    def log_likelihood(self, K: Array, B: Array) -> Array:
+    def log_likelihood(self, K: Floats, B: Floats) -> Floats:
         """Compute the log likelihood for every random walk [deg/h^1.5] and flicker [deg/h]."""
         columns = scale_columns(self.effects, len(self.values))
         products = mean_products(
@@ -53,7 +52,7 @@ class AxisMeans(NamedTuple):
         products = marginalise(products, columns.shape[1], precision)
         return np.asarray(-0.5 * (products.square[:, 0] + products.log_determinant))
 
-    def noise_ranges(self, K: Array, B: Array) -> Array:
+    def noise_ranges(self, K: Floats, B: Floats) -> Floats:
         """Return the ends of the logarithms of K and B that are tried, (parameter, end).
 
         They are those of the given values, or larger ones as far as the means scatter.
@@ -63,7 +62,7 @@ class AxisMeans(NamedTuple):
         return np.log([[K.min(), max(K.max(), most[0])], [B.min(), max(B.max(), most[1])]])
 
     def with_angle_noise(
-        self, K: Array, B: Array, likelihood: Array, least_nats: float
+        self, K: Floats, B: Floats, likelihood: Floats, least_nats: float
     ) -> AxisMeans:
         """Return the means with the likeliest angle noise, if it makes them more likely.
 
@@ -94,7 +93,7 @@ class AxisMeans(NamedTuple):
     def _with_angle(self, log_variance: float) -> AxisMeans:
         return self._replace(wander=self.wander._replace(angle=np.exp(np.array(log_variance))))
 
-    def _negative_likelihood(self, points: Array) -> Array:
+    def _negative_likelihood(self, points: Floats) -> Floats:
         """Return it for log K, log B and perhaps the log variance of the angle of every point."""
         out = []
         for point in points:
@@ -105,7 +104,7 @@ class AxisMeans(NamedTuple):
 
 
 def find_peaks(
-    negative_likelihood: Callable[[Array], Array], starts: Iterable[Array], ends: Array
+    negative_likelihood: Callable[[Floats], Floats], starts: Iterable[Floats], ends: Floats
 ) -> list[OptimizeResult]:
     """Find the largest likelihood from several starts; the best first.
 
@@ -119,7 +118,7 @@ def find_peaks(
     """
     low, high = ends.T
 
-    def add_gradient(point: Array) -> tuple[float, Array]:
+    def add_gradient(point: Floats) -> tuple[float, Floats]:
         step = np.where(point + _SHORT_STEP <= high, _SHORT_STEP, -_SHORT_STEP)
         least, *shifted = negative_likelihood(np.vstack([point, point + np.diag(step)]))
         return float(least), (np.array(shifted) - least) / step

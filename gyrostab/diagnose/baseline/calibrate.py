@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.baseline.expected_statistics import (
     NOISE,
     common_variance,
@@ -44,7 +44,6 @@ from gyrostab.errors import SchemaError
 from gyrostab.noise import TERMS
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
 #: Values of K and B on the coarse grid, as multiples of the calibrated ones. Design choice.
 _FACTORS = {"K": (0.0, 1.0 / 3.0, 1.0, 3.0, 10.0, 30.0), "B": (0.0, 1.0, 3.0, 10.0)}
 #: Share of the draws that may lie beyond the coarse grid: a tenth of the share of null records that
@@ -56,8 +55,8 @@ _MIN_LOW_SHAPE = 20.0  # of the lowest bands, which define the white noise of a 
 
 
 def _mean_noise_excess(
-    power: Array, shape: Array, spectrum: Array, quiet: NDArray[np.bool_], settings: Settings
-) -> Array:
+    power: Floats, shape: Floats, spectrum: Floats, quiet: Bools, settings: Settings
+) -> Floats:
     """Return the excess factor of the white variance of each mean, from the lowest bands.
 
     Bands that the noise does not explain in quiescent blocks tell nothing of the noise of a mean.
@@ -72,7 +71,7 @@ def _mean_noise_excess(
     return significant_level(power[:, :low] / spectrum[:, :low] - 1.0, shape[:, :low], settings)
 
 
-def grid_values(term: str, centre: float, scale: float, *, more: int = 0) -> Array:
+def grid_values(term: str, centre: float, scale: float, *, more: int = 0) -> Floats:
     """Return values of K or B, from 0 to far above the calibrated and the just visible ones.
 
     `more` values continue them in half decades.
@@ -84,8 +83,8 @@ def grid_values(term: str, centre: float, scale: float, *, more: int = 0) -> Arr
 
 
 def _coarse_grids(
-    posteriors: Sequence[Posterior], densities: Array, span: float
-) -> list[tuple[Array, Array, Array]]:
+    posteriors: Sequence[Posterior], densities: Floats, span: float
+) -> list[tuple[Floats, Floats, Floats]]:
     """Return K and B of the coarse grid of each axis, and the log posterior around every point.
 
     The largest draws have a value of the grid within a quarter of a decade; with less noise, any
@@ -109,7 +108,7 @@ def _coarse_grids(
     return [_weigh_grid(*axis) for axis in zip(posteriors, values["K"], values["B"], strict=True)]
 
 
-def _weigh_grid(posterior: Posterior, K: Array, B: Array) -> tuple[Array, Array, Array]:
+def _weigh_grid(posterior: Posterior, K: Floats, B: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the points of a grid of K and B, and the log posterior around each."""
     place = []
     for fine, coarse in ((posterior.K, K), (posterior.B, B)):
@@ -166,7 +165,7 @@ def calibrate_noise(
 def calibrate_on_known(
     blocks: xr.Dataset,
     baseline: xr.Dataset,
-    known: NDArray[np.bool_],
+    known: Bools,
     *,
     settings: Settings = DEFAULTS,
 ) -> xr.Dataset:
@@ -189,9 +188,7 @@ def calibrate_on_known(
     )
 
 
-def calibrate_axes(
-    blocks: xr.Dataset, chosen: NDArray[np.bool_], settings: Settings
-) -> list[Posterior]:
+def calibrate_axes(blocks: xr.Dataset, chosen: Bools, settings: Settings) -> list[Posterior]:
     """Compute the noise of every axis from the chosen blocks (axis, block)."""
     posteriors = []
     for row, fit in enumerate(_fit_quiescent_powers(blocks, chosen, settings)):
@@ -205,7 +202,7 @@ def calibrate_axes(
     return posteriors
 
 
-def _level_columns(quiet: NDArray[np.bool_], min_blocks: int) -> Array:
+def _level_columns(quiet: Bools, min_blocks: int) -> Floats:
     """Return steps that give each quiescent stretch its own level, (block, step).
 
     What moves the bias between two stretches, vibration for instance, is not noise of either. A
@@ -222,7 +219,7 @@ def _level_columns(quiet: NDArray[np.bool_], min_blocks: int) -> Array:
     """
     starts = np.flatnonzero(quiet & ~np.append(False, quiet[:-1]))
     block = np.arange(quiet.size)
-    columns: list[Array] = []
+    columns: list[Floats] = []
     last = 0
     for first in starts.tolist():
         if quiet[last:first].sum() >= min_blocks:
@@ -231,9 +228,7 @@ def _level_columns(quiet: NDArray[np.bool_], min_blocks: int) -> Array:
     return np.stack(columns, axis=1) if columns else np.empty((quiet.size, 0))
 
 
-def _fit_quiescent_powers(
-    blocks: xr.Dataset, chosen: NDArray[np.bool_], settings: Settings
-) -> list[Fit]:
+def _fit_quiescent_powers(blocks: xr.Dataset, chosen: Bools, settings: Settings) -> list[Fit]:
     """Return the powers of every axis as a sum of noise terms, behind a filter if it takes one.
 
     It does where some bands are foreign to the noise terms alone, and none behind the filter.
@@ -251,7 +246,7 @@ def _fit_quiescent_powers(
     return fits if any(_has_foreign_bands(fit, settings) for fit in filtered) else filtered
 
 
-def _average_quiescent(blocks: xr.Dataset, chosen: NDArray[np.bool_], columns: Array) -> list[Fit]:
+def _average_quiescent(blocks: xr.Dataset, chosen: Bools, columns: Floats) -> list[Fit]:
     """Average the powers of the chosen blocks of every axis; columns (axis, block, band, term)."""
     power, shape = blocks["power"].values, reduced_shape(blocks)
     fits = []
@@ -274,7 +269,7 @@ def _has_foreign_bands(fit: Fit, settings: Settings) -> bool:
     return bool(_is_foreign(_power_ratio(fit), fit.weight, settings).any())
 
 
-def _is_foreign(ratio: Array, weight: Array, settings: Settings) -> NDArray[np.bool_]:
+def _is_foreign(ratio: Floats, weight: Floats, settings: Settings) -> Bools:
     """Return whether the larger part of a power, or of its expected value, is not in the other.
 
     `ratio` is power over expected power, with a gamma distribution of the shape `weight`.
@@ -304,7 +299,7 @@ def _keep_explained_bands(fit: Fit, settings: Settings) -> Fit:
     return fit
 
 
-def _power_ratio(fit: Fit) -> Array:
+def _power_ratio(fit: Fit) -> Floats:
     """Return the powers over those of the noise terms that fit them best."""
     return np.asarray(fit.power / (fit.columns @ fit_squares(fit)[0]))
 
@@ -313,10 +308,10 @@ def assemble_baseline(
     blocks: xr.Dataset,
     posteriors: list[Posterior],
     *,
-    quiet: NDArray[np.bool_],
+    quiet: Bools,
     attrs: Mapping[str, Any],
-    known_mean: Array | None = None,
-    spectrum: Array | None = None,
+    known_mean: Floats | None = None,
+    spectrum: Floats | None = None,
     settings: Settings = DEFAULTS,
 ) -> xr.Dataset:
     """Assemble the noise of all axes as the Dataset described in `calibrate_noise`.
@@ -398,7 +393,7 @@ def assemble_baseline(
     )
 
 
-def _ramp_error(blocks: xr.Dataset, white: Array, value: Array, quiet: NDArray[np.bool_]) -> Array:
+def _ramp_error(blocks: xr.Dataset, white: Floats, value: Floats, quiet: Bools) -> Floats:
     """Return the error of a ramp fitted to the quiescent means [deg/h^2]."""
     hours = (blocks["begin"].values + blocks["end"].values)[:, None] / (2.0 * HOUR)
     present = quiet & np.isfinite(blocks["mean"].values)

@@ -16,10 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.optimize import OptimizeResult
 
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.diagnose.baseline.axis_means import AxisMeans, find_peaks
 from gyrostab.diagnose.baseline.expected_statistics import (
     reduced_shape,
@@ -48,7 +49,6 @@ from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
 _MIN_NOISE_SHARE = 0.05  # of the power of Q and N, that effects may leave; design choice
 _SCORING_STEPS = 4  # of Fisher scoring, as in `gyrostab.diagnose.predict.condition`
 _MIN_CHANGE = 1e-6  # of the expected powers, from which effects change them; above rounding errors
@@ -75,7 +75,7 @@ class CorrelatedBias(NamedTuple):
     nats: float
     rms: float  # degree hour-1
     time: float  # correlation time [s]
-    covariance: Array  # (2, 2): of the logarithms of rms and time
+    covariance: Floats  # (2, 2): of the logarithms of rms and time
 
 
 @dataclass(frozen=True)
@@ -84,17 +84,17 @@ class _AxisRecord:
 
     blocks: xr.Dataset
     fit: Fit
-    noise: Array  # (cell,): power of Q and N that fit best without slow noise
-    effects: Array  # (cell,): power of the effects in the model
-    band: NDArray[np.int64]  # (cell,)
-    unspread: Array  # (cell,): share of a density that gaps leave in its band
+    noise: Floats  # (cell,): power of Q and N that fit best without slow noise
+    effects: Floats  # (cell,): power of the effects in the model
+    band: Ints  # (cell,)
+    unspread: Floats  # (cell,): share of a density that gaps leave in its band
     means: AxisMeans
     #: (parameter, 2): ends of the ranges of the logarithms of K [deg/h^1.5], B [deg/h], and of a
     #: bias: of its rms times the root of its time [deg/h s^0.5], and of its time [s].
-    ends: Array
+    ends: Floats
     log_power: CubicSpline  # of a bias of unit variance (band,), by the logarithm of its time
 
-    def log_likelihoods(self, points: Array) -> Array:
+    def log_likelihoods(self, points: Floats) -> Floats:
         """Return the log likelihoods of means and powers, (2, point), with these parameters.
 
         They are the logarithms of K and B, and of a bias if there is one, (point, parameter). Q and
@@ -117,7 +117,7 @@ class _AxisRecord:
         of_powers = (np.log(expected) + self.fit.power / expected) @ self.fit.weight
         return np.array([of_means, -of_powers])
 
-    def _fit_fast_noise(self, added: Array) -> Array:
+    def _fit_fast_noise(self, added: Floats) -> Floats:
         """Return the expected powers, those of the likeliest Q and N added (Fisher scoring)."""
         columns, least = self.fit.columns[:, :2], _MIN_NOISE_SHARE * self.noise
         expected = np.maximum(self.noise + added, least)
@@ -128,7 +128,7 @@ class _AxisRecord:
             expected = np.maximum(square @ columns.T + added, least)
         return expected
 
-    def with_scatter_about(self, point: Array) -> _AxisRecord:
+    def with_scatter_about(self, point: Floats) -> _AxisRecord:
         """Return the record with powers that count less where they scatter more than expected.
 
         Their scatter about those of these parameters is their deviance over its degrees of freedom,
@@ -140,12 +140,12 @@ class _AxisRecord:
         scatter = max(deviance / max(power.size - point.size - 2, 1), 1.0)
         return replace(self, fit=self.fit._replace(weight=weight / scatter))
 
-    def start_grid(self) -> Array:
+    def start_grid(self) -> Floats:
         """Return the values of each parameter from which a search may start, (parameter, value)."""
         low, high = self.ends.T
         return np.linspace(low, high, _STARTS, axis=-1)
 
-    def _unit_powers(self, time: Array) -> Array:
+    def _unit_powers(self, time: Floats) -> Floats:
         """Return the powers (time, cell) of a bias of unit variance, gaps included."""
         power, width = np.exp(self.log_power(np.log(time))), band_widths(self.blocks)
         level = power @ width / width.sum()
@@ -153,15 +153,15 @@ class _AxisRecord:
             self.unspread * power[:, self.band] + (1.0 - self.unspread) * level[:, None]
         )
 
-    def find_best(self, points: Array) -> Array:
+    def find_best(self, points: Floats) -> Floats:
         """Return the most likely of several points, (parameter,)."""
         return np.asarray(points[self.negative_likelihood(points).argmin()])
 
-    def find_peaks(self, starts: Sequence[Array]) -> list[OptimizeResult]:
+    def find_peaks(self, starts: Sequence[Floats]) -> list[OptimizeResult]:
         """Find the largest likelihood from several starts; the best first."""
         return find_peaks(self.negative_likelihood, starts, self.ends[: starts[0].size])
 
-    def measure_evidence(self, peak: OptimizeResult) -> tuple[float, Array]:
+    def measure_evidence(self, peak: OptimizeResult) -> tuple[float, Floats]:
         """Return the evidence by Laplace's approximation, and the covariance of the parameters."""
         count = peak.x.size
         precision = _measure_curvature(self.negative_likelihood, peak.x)
@@ -169,7 +169,7 @@ class _AxisRecord:
         width = 0.5 * (count * math.log(2.0 * math.pi) - float(np.linalg.slogdet(precision)[1]))
         return width - float(peak.fun) - volume, np.asarray(np.linalg.inv(precision))
 
-    def negative_likelihood(self, points: Array) -> Array:
+    def negative_likelihood(self, points: Floats) -> Floats:
         """Return the negative log likelihood of means and powers together, (point,)."""
         return np.asarray(-self.log_likelihoods(points).sum(axis=0))
 
@@ -237,12 +237,12 @@ def _rms_and_time(peak: OptimizeResult) -> tuple[float, float]:
     return math.exp(size - 0.5 * log_time), math.exp(log_time)
 
 
-def _combine_values(*values: ArrayLike) -> Array:
+def _combine_values(*values: ArrayLike) -> Floats:
     """Return all combinations of the values of each parameter, (point, parameter)."""
     return np.stack(np.meshgrid(*values, indexing="ij"), axis=-1).reshape(-1, len(values))
 
 
-def _measure_curvature(objective: Callable[[Array], Array], best: Array) -> Array:
+def _measure_curvature(objective: Callable[[Floats], Floats], best: Floats) -> Floats:
     """Return the Hessian at a minimum, with curvatures of at least 1.
 
     A parameter that the record hardly determines may then have any value within a few octaves.
@@ -258,7 +258,7 @@ def _measure_curvature(objective: Callable[[Array], Array], best: Array) -> Arra
     return np.asarray((vectors * np.maximum(values, 1.0)) @ vectors.T)
 
 
-def _power_of_effects(state: State, axis: str) -> Array:
+def _power_of_effects(state: State, axis: str) -> Floats:
     """Return the power of the effects in the model of an axis, as they fit best, (block, band)."""
     baseline = state.baseline
     noise = axis_values(baseline, "columns", axis) @ axis_values(baseline, "square", axis)
@@ -270,7 +270,7 @@ def _power_of_effects(state: State, axis: str) -> Array:
     return power
 
 
-def _find_free_bands(state: State, axis: str) -> NDArray[np.bool_]:
+def _find_free_bands(state: State, axis: str) -> Bools:
     """Find the bands (band,) that have power of any size in the model, such as those of lines."""
     out = np.zeros(state.blocks.sizes["band"], np.bool_)
     for column in state.power_columns(axis):

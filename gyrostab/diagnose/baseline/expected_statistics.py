@@ -10,15 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.predict.linear_model import average_in_bands, spread_by_gaps
 from gyrostab.kernels.spectra.expected import expected_powers
 from gyrostab.kernels.spectra.periodogram import ordinates, taper
 from gyrostab.noise import LAWS
 
-Array = NDArray[np.float64]
 #: Random noise terms, in the order of the dimension `noise`.
 NOISE = ("Q", "N", "B", "K")
 _NORMAL = ndtri((np.arange(1001) + 0.5) / 1001)  # equally likely values
@@ -28,7 +27,7 @@ _ROUNDS = 100  # of a fixed-point iteration; limits time
 _MIN_SHARE = 1e-3  # of a variance that is left; a power of zero has no likelihood
 
 
-def line_columns(blocks: xr.Dataset) -> Array:
+def line_columns(blocks: xr.Dataset) -> Floats:
     """Return the expected power (line, term) of a full block for unit squares of Q, N, B, K.
 
     In degree2 hour-2 Hz-1 per squared unit of the noise table.
@@ -38,12 +37,12 @@ def line_columns(blocks: xr.Dataset) -> Array:
     return np.asarray(powers * np.array([LAWS[term].seconds_factor for term in NOISE]))
 
 
-def band_columns(blocks: xr.Dataset) -> Array:
+def band_columns(blocks: xr.Dataset) -> Floats:
     """Return the means (band, term) of `line_columns` over the bands."""
     return average_in_bands(line_columns(blocks).T, blocks).T
 
 
-def noise_powers(blocks: xr.Dataset, response: Array | None = None) -> Array:
+def noise_powers(blocks: xr.Dataset, response: Floats | None = None) -> Floats:
     """Return `band_columns` with the gaps of each block, (axis, block, band, term).
 
     The response (band, term) is that of a filter before samples were lost.
@@ -52,12 +51,12 @@ def noise_powers(blocks: xr.Dataset, response: Array | None = None) -> Array:
     return np.stack([spread_by_gaps(power[None, None], blocks) for power in columns.T], axis=-1)
 
 
-def sum_noise(columns: Array, squares: Array | Sequence[Array]) -> Array:
+def sum_noise(columns: Floats, squares: Floats | Sequence[Floats]) -> Floats:
     """Return the power (axis, block, band) of noise with these squares, from `noise_powers`."""
     return np.asarray(np.einsum("abfn,an->abf", columns, np.asarray(squares)))
 
 
-def common_variance(blocks: xr.Dataset) -> tuple[Array, Array]:
+def common_variance(blocks: xr.Dataset) -> tuple[Floats, Floats]:
     """Return the relative variance (axis, block) common to all bands of a block by random gaps.
 
     Returned with it is the shape (axis, block, band) of the gamma distribution of each power, given
@@ -78,7 +77,7 @@ def common_variance(blocks: xr.Dataset) -> tuple[Array, Array]:
     return common, np.asarray(1.0 / (1.0 / shape - common[..., None]))
 
 
-def reduced_shape(blocks: xr.Dataset) -> Array:
+def reduced_shape(blocks: xr.Dataset) -> Floats:
     """Return the shapes (axis, block, band) of powers as if those of a block were independent.
 
     They are reduced by the scatter that all bands of a block have in common; see `common_variance`.
@@ -91,7 +90,7 @@ def reduced_shape(blocks: xr.Dataset) -> Array:
     return np.asarray(shape * share[..., None])
 
 
-def white_variance(blocks: xr.Dataset, square: Array) -> Array:
+def white_variance(blocks: xr.Dataset, square: Floats) -> Floats:
     """Return the variance of block means due to Q and N (axis, block) [degree2 hour-2].
 
     The squares have the shape (axis or 1, 4).
@@ -113,14 +112,14 @@ def white_variance(blocks: xr.Dataset, square: Array) -> Array:
 class PassedNoise(NamedTuple):
     """Normal noise before an effect, and what the effect leaves of it."""
 
-    mean: Array  # (block,): before the effect
+    mean: Floats  # (block,): before the effect
     variance: float  # before the effect
-    share: Array  # (block,): of the variance that is left
+    share: Floats  # (block,): of the variance that is left
     gain: float  # of slow changes of the rate
 
 
 def undo_transfer(
-    transfer: Callable[[Array], Any], mean: Array, variance: float, *, known: bool = False
+    transfer: Callable[[Floats], Any], mean: Floats, variance: float, *, known: bool = False
 ) -> PassedNoise:
     """Find the normal noise that has these block means and this variance after an effect.
 

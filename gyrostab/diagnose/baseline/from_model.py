@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.baseline.calibrate import assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, line_columns, reduced_shape
 from gyrostab.diagnose.baseline.known_effects import expect_known_effects
@@ -25,7 +25,6 @@ from gyrostab.noise import TERMS
 from gyrostab.simulate.model import Model, read_model
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
 _ROUNDS = 20  # of Fisher scoring, which converges quadratically
 _MIN_FACTOR_RATIO = 0.1  # of the factor before: no round may reach zero
 
@@ -107,13 +106,13 @@ def baseline_from_model(
     return out
 
 
-def expect_ramp(blocks: xr.Dataset, ramp: Array) -> Array:
+def expect_ramp(blocks: xr.Dataset, ramp: Floats) -> Floats:
     """Return what the ramp R t [degree hour-2] of each axis adds to its block means."""
     hours = (blocks["begin"].values + blocks["end"].values) / (2.0 * HOUR)
     return np.asarray(ramp[:, None] * hours)
 
 
-def _describe_lines(baseline: xr.Dataset, blocks: xr.Dataset, square: Array) -> None:
+def _describe_lines(baseline: xr.Dataset, blocks: xr.Dataset, square: Floats) -> None:
     """Add what filters and resonances do to the lines of a band to the baseline.
 
     Where the lines of a resonance dominate, the power of the band has fewer degrees of freedom.
@@ -138,10 +137,10 @@ def _describe_lines(baseline: xr.Dataset, blocks: xr.Dataset, square: Array) -> 
 def scale_to_quiescent(
     blocks: xr.Dataset,
     posteriors: list[Posterior],
-    noise: Array,
-    added: Array,
-    quiet: NDArray[np.bool_],
-) -> tuple[list[Posterior], Array]:
+    noise: Floats,
+    added: Floats,
+    quiet: Bools,
+) -> tuple[list[Posterior], Floats]:
     """Scale the noise of a simulation to its level in quiescent blocks of the recording; say so.
 
     Parameters
@@ -196,7 +195,7 @@ def scale_to_quiescent(
 
 
 def fit_noise_factor(
-    blocks: xr.Dataset, noise: Array, added: Array, chosen: NDArray[np.bool_]
+    blocks: xr.Dataset, noise: Floats, added: Floats, chosen: Bools
 ) -> tuple[float, float] | None:
     """Fit a factor of the noise (block, band) of a single axis to the powers of chosen blocks.
 
@@ -210,7 +209,7 @@ def fit_noise_factor(
     return _fit_factor(power[good], noise[good], added[good], shape[good])
 
 
-def _fit_factor(power: Array, noise: Array, added: Array, weight: Array) -> tuple[float, float]:
+def _fit_factor(power: Floats, noise: Floats, added: Floats, weight: Floats) -> tuple[float, float]:
     """Fit ``factor * noise + added`` to gamma-distributed powers; return also the error share."""
     factor = float((weight * power / (noise + added)).sum() / weight.sum())
     information = 0.0

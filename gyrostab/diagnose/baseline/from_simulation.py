@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.special import chdtrc
 
+from gyrostab.arrays import Array, Bools, Floats
 from gyrostab.diagnose.baseline.calibrate import MIN_BANDS, assemble_baseline, calibrate_axes
 from gyrostab.diagnose.baseline.expected_statistics import noise_powers, sum_noise
 from gyrostab.diagnose.baseline.from_model import scale_to_quiescent
@@ -32,7 +32,6 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import local_level
 from gyrostab.kernels.spectra.periodogram import band_edges
 
-Array = NDArray[np.float64]
 _MAX_LINES = 100  # on an axis; limits time
 _SMOOTHING_LINES = 5  # over which a peak is smoothed; design choice
 
@@ -91,8 +90,8 @@ def baseline_from_simulation(
 
 
 def _calibrate_simulation(
-    simulated: xr.Dataset, chosen: NDArray[np.bool_], settings: Settings
-) -> tuple[list[Posterior], Array, NDArray[np.bool_]]:
+    simulated: xr.Dataset, chosen: Bools, settings: Settings
+) -> tuple[list[Posterior], Floats, Bools]:
     """Calibrate a simulation on the bands that the noise terms explain.
 
     Returns the noise of every axis, its level over time (axis, block), and the unexplained bands
@@ -123,8 +122,8 @@ def _calibrate_simulation(
 
 
 def _shared_statistics(
-    simulated: xr.Dataset, expected: Array, spectrum: Array, p_value: float
-) -> dict[str, NDArray[Any]]:
+    simulated: xr.Dataset, expected: Floats, spectrum: Floats, p_value: float
+) -> dict[str, Array]:
     """Return the cross-spectrum of the axes and the error of the coherency, where significant.
 
     `expected` is the power of the simulation (axis, block, band), `spectrum` that of the baseline.
@@ -149,10 +148,10 @@ def _shared_statistics(
 def _line_statistics(
     simulated: xr.Dataset,
     blocks: xr.Dataset,
-    expected: Array,
-    unexplained: NDArray[np.bool_],
+    expected: Floats,
+    unexplained: Bools,
     settings: Settings,
-) -> dict[str, Array]:
+) -> dict[str, Floats]:
     """Return significant lines, the most that they may be, and unexplained peaks, if any.
 
     `expected` (axis, block, band) is the power of the noise terms in the simulation, with their

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Bools, Complexes, Floats
 from gyrostab.diagnose.baseline.expected_statistics import (
     NOISE,
     band_columns,
@@ -39,25 +39,24 @@ from gyrostab.physics.sampling import LoggerFilter
 from gyrostab.simulate.model import Model
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
 EVERYWHERE = "lattice"  # the mark of every sample: calibrated noise includes what it does
 
 
 class KnownEffects(NamedTuple):
     """Known effects of a model in the statistics of a record."""
 
-    mean: Array  # (axis, block): [degree hour-1]
+    mean: Floats  # (axis, block): [degree hour-1]
     #: (axis, block, band): expected power of noise and effects [degree2 hour-2 Hz-1].
-    spectrum: Array
+    spectrum: Floats
     #: (axis, block): share of the lowest band that is white noise of the means.
-    white_share: Array
+    white_share: Floats
     #: Further variables of `gyrostab.diagnose.reduce.schema.BASELINE`, if there are any: the
     #: cross-spectrum, lines at full resolution, and random processes in the means.
-    variables: dict[str, NDArray[Any]]
+    variables: dict[str, Array]
     left_out: list[str]  # effects that also show elsewhere
 
 
-def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> KnownEffects:
+def expect_known_effects(blocks: xr.Dataset, model: Model, square: Floats) -> KnownEffects:
     """Predict the known effects of a model in the record, given squares of the noise (axis, 4).
 
     Raises
@@ -72,9 +71,9 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Array) -> Kno
     squares = np.repeat(square[:, None], shape[1], axis=1)
     # factors of filters on the noise terms, (axis, band, term)
     added, response = np.zeros(shape), np.ones((shape[0], shape[2], len(NOISE)))
-    narrow: list[tuple[Effect, list[int], Array]] = []
-    coherent: list[tuple[NDArray[np.complex128], Array]] = []
-    wandering: list[tuple[Prediction, list[int], Callable[[str], Array]]] = []
+    narrow: list[tuple[Effect, list[int], Floats]] = []
+    coherent: list[tuple[Complexes, Floats]] = []
+    wandering: list[tuple[Prediction, list[int], Callable[[str], Floats]]] = []
     left_out = []
     for effect, rows in _effects_on_rows(model, axes):
         of_effect = tuple(axes[row] for row in rows)
@@ -125,7 +124,7 @@ def _effects_on_rows(model: Model, axes: list[str]) -> Iterator[tuple[Effect, li
         )
 
 
-def _filtered_lines(model: Model, square: Array, blocks: xr.Dataset) -> Array:
+def _filtered_lines(model: Model, square: Floats, blocks: xr.Dataset) -> Floats:
     """Return the density of the noise behind filters at full resolution, (axis, line)."""
     axes = [str(axis) for axis in blocks["axis"].values]
     columns = line_columns(blocks)
@@ -153,7 +152,7 @@ def filtered_blocks(blocks: xr.Dataset, model: Model) -> xr.Dataset:
     )
 
 
-def _share_left(effect: Effect, model: Model, rows: list[int], blocks: xr.Dataset) -> Array:
+def _share_left(effect: Effect, model: Model, rows: list[int], blocks: xr.Dataset) -> Floats:
     """Return the share of the noise that an effect on single samples leaves, (row, block)."""
     share = np.ones((len(rows), blocks.sizes["block"]))
     if effect.transfer(np.zeros(1)) is None:
@@ -168,7 +167,7 @@ def _share_left(effect: Effect, model: Model, rows: list[int], blocks: xr.Datase
 
 def _added_powers(
     effect: Effect, prediction: Prediction, rows: list[int], blocks: xr.Dataset
-) -> Iterator[tuple[NDArray[np.complex128], Array]]:
+) -> Iterator[tuple[Complexes, Floats]]:
     """Yield the factor on each axis and the density (axis, block, band) of each spectrum."""
     axes = tuple(str(axis) for axis in blocks["axis"].values[rows])
     shape = tuple(blocks.sizes[name] for name in ("axis", "block", "band"))
@@ -185,15 +184,15 @@ def _added_powers(
 
 
 def random_means(
-    wandering: Sequence[tuple[Prediction, list[int], Callable[[str], Array]]],
+    wandering: Sequence[tuple[Prediction, list[int], Callable[[str], Floats]]],
     shape: tuple[int, ...],
-) -> tuple[dict[str, NDArray[Any]], Array]:
+) -> tuple[dict[str, Array], Floats]:
     """Return the steady processes of effects as variables, and their power in the lowest band.
 
     Whatever they add there is not white noise of the means. Each effect comes with its rows, and
     its sizes on them.
     """
-    processes: list[tuple[Array, float]] = []  # variance on each axis, correlation time
+    processes: list[tuple[Floats, float]] = []  # variance on each axis, correlation time
     walk, power = np.zeros((2, *shape[:2]))  # variance rate of random walks, and power of all
     for prediction, rows, sizes in wandering:
         for name, (time, variance) in prediction.wander.items():
@@ -235,14 +234,14 @@ def _switches_slowly(prediction: Prediction, blocks: xr.Dataset) -> bool:
     return bool(prediction.levels) and min(times, default=0.0) >= float(blocks.attrs["block_s"])
 
 
-def _is_steady(time: float, variance: Array) -> bool:
+def _is_steady(time: float, variance: Floats) -> bool:
     """Return whether a process has a constant variance, or is a walk."""
     return bool(np.isinf(time) or np.ptp(variance) == 0.0)
 
 
 def _shared_cross(
-    coherent: Sequence[tuple[NDArray[np.complex128], Array]], response: Array, blocks: xr.Dataset
-) -> dict[str, NDArray[Any]]:
+    coherent: Sequence[tuple[Complexes, Floats]], response: Floats, blocks: xr.Dataset
+) -> dict[str, Array]:
     """Return the cross-spectrum of coherent effects after a filter (axis, 1, band), if any.
 
     An effect has a factor on each axis, and a density (axis, block, band) for a factor of 1.
@@ -258,7 +257,7 @@ def _shared_cross(
 
 def expect_known_motion(
     blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Find the blocks in which a known mean moves far above its noise, (axis, block).
 
     None on an axis where most blocks move. The mean of such a block is known, but not the motion

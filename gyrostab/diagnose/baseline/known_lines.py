@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Floats
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
 from gyrostab.diagnose.predict.filter_response import filter_factors
 from gyrostab.diagnose.predict.linear_model import (
@@ -24,7 +23,6 @@ from gyrostab.kernels.spectra.periodogram import ordinates, taper
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.base import Effect
 
-Array = NDArray[np.float64]
 _LEAK_LINES = 100  # on either side, that a line leaks into; limits time
 _PLACES_BETWEEN = 4  # positions of a line on either side of a frequency of the spectrum
 _FINER = 2 * _PLACES_BETWEEN  # frequencies for each line
@@ -32,8 +30,8 @@ _PEAK_POINTS = 1000  # within a step of a density
 
 
 def expect_lines(
-    blocks: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], Array]], response: Array
-) -> dict[str, Array]:
+    blocks: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], Floats]], response: Floats
+) -> dict[str, Floats]:
     """Return lines of effects after a filter (axis, band), as variables of a baseline.
 
     The effects come with their axes and their power in the bands.
@@ -74,7 +72,7 @@ def expect_lines(
 
 def resonance_density(
     effect: Effect, name: str, blocks: xr.Dataset, axes: tuple[str, ...]
-) -> Array | None:
+) -> Floats | None:
     """Return the tapered density of a resonance per squared unit, (line,); None without resonance.
 
     Its peak may be narrower than the width of the taper.
@@ -97,7 +95,7 @@ def resonance_density(
     return _average_over_taper(density, int(blocks.attrs["block_samples"]))
 
 
-def line_factors(effect: Effect, blocks: xr.Dataset) -> NDArray[Any]:
+def line_factors(effect: Effect, blocks: xr.Dataset) -> Array:
     """Return the factor (line, term) of a filter on the tapered density of Q, N, B and K."""
     frequency, rate = blocks["line_frequency"].values, float(blocks.attrs["sampling_rate_hz"])
     fine = _between_lines(frequency)
@@ -113,12 +111,12 @@ def line_factors(effect: Effect, blocks: xr.Dataset) -> NDArray[Any]:
     return np.stack(factors, axis=-1)
 
 
-def _between_lines(frequency: Array) -> Array:
+def _between_lines(frequency: Floats) -> Floats:
     """Return frequencies up to the highest one, `_FINER` for each line."""
     return np.asarray(frequency[0] / _FINER * np.arange(1, _FINER * frequency.size + 1))
 
 
-def _average_over_taper(density: Array, size: int) -> Array:
+def _average_over_taper(density: Floats, size: int) -> Floats:
     """Return the density that the lines of a tapered block of `size` samples have.
 
     The density is at the frequencies of `_between_lines`.
@@ -131,13 +129,13 @@ def _average_over_taper(density: Array, size: int) -> Array:
     return np.asarray(tapered[density.size + _FINER : 2 * density.size + 1 : _FINER])
 
 
-def _take_leakage(lines: NDArray[Any]) -> NDArray[Any]:
+def _take_leakage(lines: Array) -> Array:
     """Return each line (..., line) and those that it leaks into, along another dimension."""
     padded = np.pad(lines, [(0, 0)] * (lines.ndim - 1) + [(LEAK_LINES, LEAK_LINES)])
     return np.lib.stride_tricks.sliding_window_view(padded, 2 * LEAK_LINES + 1, axis=-1)
 
 
-def independent_line_share(density: Array, blocks: xr.Dataset) -> Array:
+def independent_line_share(density: Floats, blocks: xr.Dataset) -> Floats:
     """Return the equivalent share of independent lines of a band (axis, band).
 
     It is below 1 if the density (axis, line) is dominated by some lines.
@@ -145,7 +143,7 @@ def independent_line_share(density: Array, blocks: xr.Dataset) -> Array:
     return average_in_bands(density, blocks) ** 2 / average_in_bands(density**2, blocks)
 
 
-def _line_leakage(size: int, apart: float = 0.0) -> tuple[Array, Array, Array]:
+def _line_leakage(size: int, apart: float = 0.0) -> tuple[Floats, Floats, Floats]:
     """Return the share of a line in the lines around it: at an offset, on average, at most.
 
     The offset `apart` from the middle line is in lines.

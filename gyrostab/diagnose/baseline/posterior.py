@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.baseline.axis_means import AxisMeans
 from gyrostab.diagnose.evidence.wandering import RandomProcesses, no_processes
 from gyrostab.diagnose.predict.filter_response import band_response
@@ -19,7 +19,6 @@ from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.physics.sampling import LoggerFilter
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
 #: Number of draws from the posterior of the noise of an axis; limits memory.
 DRAWS = 512
 _MIN_POWER_RATIO = 0.05  # of expected powers that fitted effects may leave; design choice
@@ -31,19 +30,19 @@ class Fit(NamedTuple):
     """Band powers as a sum of noise terms and effects."""
 
     #: (cell,): powers, averaged over blocks, and the shapes of their gamma distributions.
-    power: Array
-    columns: Array  # (cell, 4): power of the noise terms per squared coefficient
-    weight: Array
-    known: Array | None = None  # (cell,): known power of effects
-    free_columns: Array | None = None  # (cell, column): power of effects per unit of free sizes
-    precision: Array | None = None  # (column,): precisions of normal priors of these sizes about 0
-    start: Array | None = None  # (cell,): expected powers to start from; white noise by default
+    power: Floats
+    columns: Floats  # (cell, 4): power of the noise terms per squared coefficient
+    weight: Floats
+    known: Floats | None = None  # (cell,): known power of effects
+    free_columns: Floats | None = None  # (cell, column): power of effects per unit of free sizes
+    precision: Floats | None = None  # (column,): precisions of normal priors of these sizes about 0
+    start: Floats | None = None  # (cell,): expected powers to start from; white noise by default
 
-    def rest(self) -> Array:
+    def rest(self) -> Floats:
         """Return the powers minus the known ones."""
         return self.power if self.known is None else self.power - self.known
 
-    def free(self) -> tuple[Array, Array]:
+    def free(self) -> tuple[Floats, Floats]:
         """Return columns and precisions of the free sizes."""
         columns, precision = self.free_columns, self.precision
         columns = np.empty((self.power.size, 0)) if columns is None else columns
@@ -55,22 +54,22 @@ class Posterior(NamedTuple):
 
     #: (4,): squares of Q, N, B, K that fit the band powers best, and their errors [squared units of
     #: the noise table].
-    square: Array
-    error: Array
+    square: Floats
+    error: Floats
     #: (cell,): fine grid of K and B, and its posterior probabilities.
-    K: Array
-    B: Array
-    weight: Array
-    draws: Array  # (draw, 4): squares of Q, N, B, K in the band powers
+    K: Floats
+    B: Floats
+    weight: Floats
+    draws: Floats  # (draw, 4): squares of Q, N, B, K in the band powers
     #: (draw, 2): squares of B and K in the block means; the same as in `draws` when `joined`.
-    slow: Array
+    slow: Floats
     joined: bool  # whether band powers and means agree about B and K
     #: (4,): squares that fit the bands best which the noise terms explain; None if these are all.
-    of_means: Array | None = None
+    of_means: Floats | None = None
     angle: float = 0.0  # variance of the angle where blocks meet [arcsec2]
 
 
-def average_blocks(power: Array, shape: Array, columns: Array) -> Fit:
+def average_blocks(power: Floats, shape: Floats, columns: Floats) -> Fit:
     """Average over blocks; power and shape (block, band), columns (block, band, term)."""
     use = np.where(np.isfinite(power) & np.isfinite(shape), shape, 0.0)
     total = use.sum(axis=0)
@@ -82,11 +81,11 @@ def average_blocks(power: Array, shape: Array, columns: Array) -> Fit:
 
 
 def average_groups(
-    power: Array,
-    shape: Array,
-    columns: Array,
-    level: Array,
-    chosen: NDArray[np.bool_],
+    power: Floats,
+    shape: Floats,
+    columns: Floats,
+    level: Floats,
+    chosen: Bools,
     count: int,
 ) -> Fit:
     """Average the chosen blocks in at most so many groups of similar level (block,)."""
@@ -96,7 +95,7 @@ def average_groups(
     return Fit(*map(np.concatenate, zip(*fits, strict=True)))
 
 
-def fit_squares(fit: Fit) -> tuple[Array, Array, Array]:
+def fit_squares(fit: Fit) -> tuple[Floats, Floats, Floats]:
     """Fit non-negative squares by gamma likelihood (Whittle).
 
     Returned with them are their Fisher information with the effects free, and the expected powers.
@@ -141,7 +140,7 @@ def fit_squares(fit: Fit) -> tuple[Array, Array, Array]:
     return square, normal, spectrum
 
 
-def _choose_step(fit: Fit, spectrum: Array, next_spectrum: Array) -> float:
+def _choose_step(fit: Fit, spectrum: Floats, next_spectrum: Floats) -> float:
     """Return the step towards the next spectrum, halved until the likelihood does not fall."""
     log_likelihood = _log_likelihood(fit, spectrum)
     fraction = 1.0
@@ -152,14 +151,14 @@ def _choose_step(fit: Fit, spectrum: Array, next_spectrum: Array) -> float:
     return fraction
 
 
-def _log_likelihood(fit: Fit, spectrum: Array) -> float:
+def _log_likelihood(fit: Fit, spectrum: Floats) -> float:
     """Return the gamma log likelihood of a spectrum."""
     return -float((fit.weight * (np.log(spectrum) + fit.power / spectrum)).sum())
 
 
 def _eliminate_free_sizes(
-    free_columns: Array, precision: Array, columns: Array, power: Array, weight: Array
-) -> tuple[Array, Array, Array, Array]:
+    free_columns: Floats, precision: Floats, columns: Floats, power: Floats, weight: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Eliminate free sizes from the normal equations of `columns`.
 
     The sizes are ``to_right - to_noise @ squares``.
@@ -176,7 +175,7 @@ def _eliminate_free_sizes(
 
 def fit_filter_response(
     blocks: xr.Dataset, fits: Sequence[Fit], *, settings: Settings = DEFAULTS
-) -> Array | None:
+) -> Floats | None:
     """Return the response (band, term) of the filter that describes the powers of all axes best.
 
     A low-pass or an average removes most of the noise at high frequencies, and leaves that of the
@@ -198,7 +197,7 @@ def fit_filter_response(
     return responses[chosen] if all(is_better) else None
 
 
-def fit_behind(fit: Fit, columns: Array) -> tuple[float, float]:
+def fit_behind(fit: Fit, columns: Floats) -> tuple[float, float]:
     """Return the largest log likelihood of powers over noise of these columns, and its Q^2."""
     square, _, expected = fit_squares(fit._replace(columns=columns))
     return _log_likelihood(fit, expected), float(square[0])
@@ -215,7 +214,7 @@ def choose_filter(behind: Sequence[Sequence[tuple[float, float]]], settings: Set
     return int(np.where(is_close, quantization, np.inf).argmin())
 
 
-def with_floor(square: Array, fit: Fit) -> Array:
+def with_floor(square: Floats, fit: Fit) -> Floats:
     """Return squares with the smallest resolved N^2: white noise hides in the smallest power."""
     least = 1e-3 * max(float(np.min(fit.power)), np.finfo(float).tiny) / HOUR
     return np.maximum(square, [0.0, least, 0.0, 0.0])
@@ -226,7 +225,7 @@ def visible_coefficients(density: float, span: float) -> tuple[float, float]:
     return float(np.sqrt(HOUR * 3.0 * density) / span), float(np.sqrt(density / span / 0.44))
 
 
-def fine_grid(density: float, span: float, step: float) -> tuple[Array, Array]:
+def fine_grid(density: float, span: float, step: float) -> tuple[Floats, Floats]:
     """Return values of K and B, from invisible in the means to far above white noise."""
     K, B = visible_coefficients(density, span)
     top = 300.0 * span / step
@@ -237,8 +236,8 @@ def fine_grid(density: float, span: float, step: float) -> tuple[Array, Array]:
 
 
 def _likelihood_of_powers(
-    fit: Fit, spectrum: Array, K: Array, B: Array
-) -> tuple[Array, Array, Array]:
+    fit: Fit, spectrum: Floats, K: Floats, B: Floats
+) -> tuple[Floats, Floats, Floats]:
     """Compute the log likelihood of the powers for every K and B.
 
     Returns also the best Q and N, unbounded (point, 2), and their information.
@@ -264,7 +263,7 @@ def _likelihood_of_powers(
     return likelihood, best[:, :2], normal
 
 
-def _normal_matrix(fast_columns: Array, weight: Array, precision: Array) -> Array:
+def _normal_matrix(fast_columns: Floats, weight: Floats, precision: Floats) -> Floats:
     """Return the normal matrix of Q, N and free sizes."""
     normal = fast_columns.T @ (weight[:, None] * fast_columns)
     if precision.size:
@@ -273,7 +272,7 @@ def _normal_matrix(fast_columns: Array, weight: Array, precision: Array) -> Arra
     return normal
 
 
-def _draw_near(mean: Array, covariance: Array, rng: np.random.Generator) -> Array:
+def _draw_near(mean: Floats, covariance: Floats, rng: np.random.Generator) -> Floats:
     """Draw squares of Q and N about `mean` (draw, 2), Q^2 not negative."""
     sd = float(np.sqrt(covariance[0, 0]))
     low = np.minimum(-mean[:, 0] / sd, 30.0)
@@ -285,7 +284,7 @@ def _draw_near(mean: Array, covariance: Array, rng: np.random.Generator) -> Arra
     return np.stack([Q, N], axis=1)
 
 
-def _draw_positive(square: Array, information: Array, rng: np.random.Generator) -> Array:
+def _draw_positive(square: Floats, information: Floats, rng: np.random.Generator) -> Floats:
     """Draw squares (draw, 4) about a fit, with the covariance of those that are not zero.
 
     Those that are zero have the error that they have with all others fixed, on one side.
@@ -305,9 +304,9 @@ def noise_posterior(
     fit: Fit,
     blocks: xr.Dataset,
     row: int,
-    variance: Array,
-    use: NDArray[np.bool_],
-    effects: Array | None,
+    variance: Floats,
+    use: Bools,
+    effects: Floats | None,
     settings: Settings,
     wander: RandomProcesses | None = None,
 ) -> Posterior:

@@ -13,12 +13,11 @@ truncated towards zero, however fine: an angle has no zero.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Bools, Floats
 from gyrostab.diagnose.baseline.posterior import average_blocks, fit_squares
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -30,7 +29,7 @@ _SERIES_TERMS = 40  # of the correlation series of `angle_share`
 
 def rounded_rates(
     blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Find the axes (axis,) with a rounded or truncated rate, by the spectrum and the zero bin.
 
     If the baseline is not calibrated on this record, the record's own noise is estimated.
@@ -44,8 +43,8 @@ def rounded_rates(
 
 
 def _rounded_by_spectrum(
-    blocks: xr.Dataset, baseline: xr.Dataset, step: NDArray[np.float64], settings: Settings
-) -> NDArray[np.bool_]:
+    blocks: xr.Dataset, baseline: xr.Dataset, step: Floats, settings: Settings
+) -> Bools:
     """Return the axes whose spectrum rules out the Q of an angle grid.
 
     The Q^2 of a rounded rate is nearer to 0 than to that of a counter of angles, on either side: a
@@ -83,7 +82,7 @@ def _rounded_by_spectrum(
     )
 
 
-def _fit_q_square(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.float64]:
+def _fit_q_square(blocks: xr.Dataset, baseline: xr.Dataset) -> Floats:
     """Return the Q^2 that fits the quiescent powers best; negative if they fall at the end."""
     out = []
     for number in range(blocks.sizes["axis"]):
@@ -104,7 +103,7 @@ def _fit_q_square(blocks: xr.Dataset, baseline: xr.Dataset) -> NDArray[np.float6
     return np.array(out)
 
 
-def angle_share(mean: NDArray[Any], scatter: float) -> NDArray[np.float64]:
+def angle_share(mean: Array, scatter: float) -> Floats:
     """Return the Q^2 of an angle counter over that of independent rounding errors.
 
     The rounding error is uniform; its correlation from one sample to the next is (6 / pi^2) sum

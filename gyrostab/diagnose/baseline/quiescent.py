@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.predict.windows import fill_linearly
 from gyrostab.diagnose.reduce.block_statistics import iso
 from gyrostab.diagnose.reduce.schema import weighted_mean
@@ -17,21 +17,20 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError
 from gyrostab.time.stamps import stamp_ns
 
-Array = NDArray[np.float64]
 #: Blocks over which the noise level is averaged. Design choice.
 LEVEL_SPANS = (1, 5, 15)
 _MIN_GIVEN_SAMPLES = 100  # as in the shortest default block; they give N to 7 %
 _MIN_GIVEN_BANDS = 4  # with a spectrum: as many as noise terms are fitted to them
 
 
-def _running_sum(values: Array, count: int) -> Array:
+def _running_sum(values: Floats, count: int) -> Floats:
     """Sum over `count` neighbouring values, fewer at the ends."""
     return np.asarray(np.convolve(values, np.ones(count), "same"), np.float64)
 
 
-def _distance_from_rest(blocks: xr.Dataset, settings: Settings) -> list[Array]:
+def _distance_from_rest(blocks: xr.Dataset, settings: Settings) -> list[Floats]:
     """Return for each channel how far each block is from rest, 1 at the limit."""
-    distances: list[Array] = []
+    distances: list[Floats] = []
     step = float(blocks["end"][0] - blocks["begin"][0])
     for name in (str(name) for name in blocks.data_vars):
         if not name.startswith("channel_"):
@@ -77,8 +76,8 @@ def _record_length(blocks: xr.Dataset) -> float:
 
 
 def noise_level_excess(
-    residual: Array, weight: Array, *, settings: Settings = DEFAULTS
-) -> tuple[Array, Array]:
+    residual: Floats, weight: Floats, *, settings: Settings = DEFAULTS
+) -> tuple[Floats, Floats]:
     """Measure the noise level of every block over the smallest span in which it is significant.
 
     The level (block,) is expected to be 1; its largest deviation above 1 over all spans is in
@@ -107,13 +106,13 @@ def noise_level_excess(
     return level, deviation
 
 
-def significant_level(residual: Array, weight: Array, settings: Settings) -> Array:
+def significant_level(residual: Floats, weight: Floats, settings: Settings) -> Floats:
     """Return the noise level (block,) of `noise_level_excess`; 1 if not significant."""
     level, deviation = noise_level_excess(residual, weight, settings=settings)
     return np.where(deviation > settings.excess_sigma, level, 1.0)
 
 
-def _typical_spectrum(power: Array, shape: Array) -> Array | None:
+def _typical_spectrum(power: Floats, shape: Floats) -> Floats | None:
     """Return the spectrum (band,) of the block with the median level, or None without data."""
     mean, total = weighted_mean(power, shape)
     if not (total > 0.0).all():
@@ -122,9 +121,7 @@ def _typical_spectrum(power: Array, shape: Array) -> Array | None:
     return np.asarray(mean * np.median(level[total_of_block > 0.0]))
 
 
-def _drop_noisy_blocks(
-    blocks: xr.Dataset, start: NDArray[np.bool_], settings: Settings
-) -> NDArray[np.bool_]:
+def _drop_noisy_blocks(blocks: xr.Dataset, start: Bools, settings: Settings) -> Bools:
     """Return blocks (axis, block) that are not noisier than the typical block of `start`."""
     power, shape = blocks["power"].values, blocks["shape"].values
     quiescent = np.broadcast_to(start, power.shape[:2]).copy()
@@ -149,7 +146,7 @@ def _drop_noisy_blocks(
 
 def find_quiescent_blocks(
     blocks: xr.Dataset, quiet: Any = None, *, settings: Settings = DEFAULTS
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Find the quiescent blocks (axis, block), to calibrate on.
 
     Without `quiet` these are the blocks at rest, or the quietest where too few are.
@@ -173,7 +170,7 @@ def find_quiescent_blocks(
 
 def given_quiescent_blocks(
     blocks: xr.Dataset, quiet: Any, *, settings: Settings = DEFAULTS
-) -> NDArray[np.bool_] | None:
+) -> Bools | None:
     """Return the blocks (axis, block) given as quiescent by the user, if they can be used.
 
     None without `quiet`, and, with a warning, where its whole blocks hold fewer than 100 samples or
@@ -205,7 +202,7 @@ def given_quiescent_blocks(
     return np.broadcast_to(chosen, (blocks.sizes["axis"], n)).copy()
 
 
-def _is_usable(blocks: xr.Dataset, chosen: NDArray[np.bool_], better_count: int) -> bool:
+def _is_usable(blocks: xr.Dataset, chosen: Bools, better_count: int) -> bool:
     """Return whether given blocks hold enough to calibrate on; warn where that is little."""
     step, size = float(blocks.attrs["block_s"]), int(blocks.attrs["block_samples"])
     count = int(chosen.sum())
@@ -245,7 +242,7 @@ def _seconds_since_start(blocks: xr.Dataset, edge: Any) -> float:
     return float((instant - start) / np.timedelta64(1, "ns")) / 1e9
 
 
-def find_quiescent_spans(blocks: xr.Dataset, quiet: NDArray[np.bool_]) -> list[list[str]]:
+def find_quiescent_spans(blocks: xr.Dataset, quiet: Bools) -> list[list[str]]:
     """Return the spans in which any axis is quiescent, [start, end] as ISO times."""
     edges = np.flatnonzero(np.diff(quiet.any(axis=0), prepend=False, append=False)).reshape(-1, 2)
     begin, end = blocks["begin"].values, blocks["end"].values

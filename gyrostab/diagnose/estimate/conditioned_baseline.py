@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Complexes
 from gyrostab.diagnose.baseline.known_effects import EVERYWHERE
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.examination import Identifications
@@ -38,7 +38,7 @@ from gyrostab.physics.registry import effects
 def predict_baseline(
     identifications: Identifications,
     baseline: xr.Dataset,
-    known: NDArray[np.bool_] | None = None,
+    known: Bools | None = None,
     *,
     left_out: Sequence[Selection] = (),
 ) -> xr.Dataset:
@@ -113,7 +113,7 @@ def predict_baseline(
     )
 
 
-def _cross_spectra(components: Sequence[Component], state: State) -> NDArray[np.complex128]:
+def _cross_spectra(components: Sequence[Component], state: State) -> Complexes:
     """Return the cross-spectra of noise that axes have in common, in a state without effects."""
     shape = state.weight.shape[1:]
     pairs = pair_rows(state.blocks)
@@ -127,7 +127,7 @@ def _cross_spectra(components: Sequence[Component], state: State) -> NDArray[np.
 
 
 def expected_baseline(
-    identifications: Identifications, baseline: xr.Dataset, known: NDArray[np.bool_] | None = None
+    identifications: Identifications, baseline: xr.Dataset, known: Bools | None = None
 ) -> xr.Dataset:
     """Return the baseline with the expected effects only, fitted to the `known` blocks."""
     return (

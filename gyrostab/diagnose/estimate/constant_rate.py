@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, PassedNoise, undo_transfer
 from gyrostab.diagnose.baseline.from_model import expect_ramp, fit_noise_factor
@@ -19,7 +18,6 @@ from gyrostab.physics.base import Effect
 from gyrostab.simulate.model import read_model
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
 _MIN_GAIN = 0.05  # of slow changes; with less, the record does not show them
 
 

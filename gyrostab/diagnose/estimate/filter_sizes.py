@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.baseline.expected_statistics import (
     band_columns,
     reduced_shape,
@@ -30,8 +30,6 @@ from gyrostab.diagnose.predict.linear_model import (
 from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.registry import effects
-
-Array = NDArray[np.float64]
 
 ZOOM_POINTS, ZOOM_STEPS = 21, 4  # of the refinement of a cutoff on its grid
 _CUTOFF_STEP = 0.01  # relative, of the likeliest cutoff; limits resolution
@@ -162,7 +160,7 @@ def _widen_interval(
     return mean, (high - low) / (2.0 * NORMAL_95), low, high
 
 
-def _average_powers(axis: str, state: State) -> tuple[Fit, Array]:
+def _average_powers(axis: str, state: State) -> tuple[Fit, Floats]:
     """Average the powers of an axis over the record, with free noise and effects.
 
     The second result is how gaps mix the bands of the noise.

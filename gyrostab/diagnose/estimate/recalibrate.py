@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.baseline.calibrate import assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import (
     NOISE,
@@ -42,7 +42,6 @@ from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.diagnose.reduce.schema import BASELINE, label_variables
 from gyrostab.physics.base import Effect
 
-Array = NDArray[np.float64]
 LEVEL_GROUPS = 150  # of blocks of similar level, over which powers are averaged
 
 
@@ -50,18 +49,18 @@ LEVEL_GROUPS = 150  # of blocks of similar level, over which powers are averaged
 class AxisEffects:
     """What the effects do on one axis."""
 
-    known: Array  # (block, band): power of fixed size
-    response: Array  # (band, term): factor of the noise
+    known: Floats  # (block, band): power of fixed size
+    response: Floats  # (band, term): factor of the noise
     doubt: float  # relative error of `known`
-    free: list[Array] = field(default_factory=list)  # (block, band): power per unit of a free size
-    means: list[Array] = field(default_factory=list)  # (block,): means per unit of a free size
+    free: list[Floats] = field(default_factory=list)  # (block, band): power per unit of a free size
+    means: list[Floats] = field(default_factory=list)  # (block,): means per unit of a free size
 
 
 def recalibrate(
     identifications: Identifications,
     baseline: xr.Dataset,
     fitted: Sequence[Fitted],
-    known: NDArray[np.bool_] | None = None,
+    known: Bools | None = None,
 ) -> xr.Dataset:
     """Calibrate the noise with the identified effects in the model, those of free size free.
 
@@ -262,7 +261,7 @@ def _find_processes(fitted: Sequence[Fitted], blocks: xr.Dataset) -> dict[str, A
     return label_variables(random_means(wandering, shape)[0], BASELINE)
 
 
-def _effect_power(effect: Effect, blocks: xr.Dataset, axis: str) -> Array:
+def _effect_power(effect: Effect, blocks: xr.Dataset, axis: str) -> Floats:
     """Return the power that an effect itself predicts on an axis, (block, band)."""
     prediction = predict_effect(effect, blocks, (axis,), blocks["frequency"].values)
     out = np.zeros((blocks.sizes["block"], blocks.sizes["band"]))
@@ -277,7 +276,7 @@ def _fit_noise(
     state: State,
     row: int,
     axis_effects: AxisEffects,
-    chosen: NDArray[np.bool_],
+    chosen: Bools,
     wander: RandomProcesses,
 ) -> Posterior | None:
     """Fit the noise of an axis with the effects; None where too little is left to determine it."""
@@ -302,12 +301,12 @@ def _fit_noise(
 
 
 def _average_powers(
-    power: Array,
-    shape: Array,
-    columns: Array,
-    expected: Array,
+    power: Floats,
+    shape: Floats,
+    columns: Floats,
+    expected: Floats,
     axis_effects: AxisEffects,
-    chosen: NDArray[np.bool_],
+    chosen: Bools,
 ) -> Fit:
     """Average the powers over blocks of similar level."""
     free_columns = [

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.identify.identification import Selection, components_of
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
@@ -21,12 +21,8 @@ from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 
-Array = NDArray[np.float64]
 
-
-def unexplained_motion(
-    blocks: xr.Dataset, identified: Iterable[Selection], state: State
-) -> NDArray[np.bool_]:
+def unexplained_motion(blocks: xr.Dataset, identified: Iterable[Selection], state: State) -> Bools:
     """Find the moving blocks (axis, block) of axes without an effect that explains the motion.
 
     An effect must leave next to nothing of the motion, in the means or, where it follows a channel
@@ -80,7 +76,7 @@ def unexplained_motion(
 
 
 def _explains_power(
-    components: Iterable[Component], axis: str, moving: NDArray[np.bool_], state: State
+    components: Iterable[Component], axis: str, moving: Bools, state: State
 ) -> bool:
     """Return whether what follows channels leaves next to nothing of the power in a motion."""
     followers = [
@@ -102,9 +98,9 @@ def _explains_power(
 
 
 def _is_explained(
-    mean: Array,
-    moving: NDArray[np.bool_],
-    columns: Array,
+    mean: Floats,
+    moving: Bools,
+    columns: Floats,
     span: float,
     settings: Settings,
     *,

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.evidence.products import WIDTHS, marginalise, mean_products, scale_columns
 from gyrostab.diagnose.evidence.telegraph import (
     TelegraphCourses,
@@ -33,7 +33,6 @@ from gyrostab.kernels.spectra.periodogram import (
 )
 from gyrostab.physics.phase import lorentz_density
 
-Array = NDArray[np.float64]
 _AR_ORDERS = (0, 1, 2, 4, 8, 16, 32)  # of the autoregression that approximates any spectrum
 _MAX_MEANS = 12_000  # in the search of a course; sub-blocks are merged beyond; limits time
 _PARTS_PER_SUB_BLOCK = 64  # each on one level; design choice
@@ -62,8 +61,8 @@ class SwitchingEvidence:
     #: Lower bound of the log Bayes factor against noise; -inf with fewer than `min_switches`
     #: switches, or if normal noise of any spectrum comes within `two_level_nats`.
     evidence_nats: float
-    share: Array  # (block, sub_block): share of each sub-block on the upper level
-    times: Array  # (2,): mean times on the lower and on the upper level [s]
+    share: Floats  # (block, sub_block): share of each sub-block on the upper level
+    times: Floats  # (2,): mean times on the lower and on the upper level [s]
     switch_count: float  # expected number
     #: Two levels beat white noise with a random walk, but the sub-blocks do not have two levels.
     refuted: bool = False
@@ -74,7 +73,7 @@ def switching_evidence(
     baseline: xr.Dataset,
     *,
     axis: str,
-    given: Array | None = None,
+    given: Floats | None = None,
     settings: Settings = DEFAULTS,
 ) -> SwitchingEvidence | None:
     """Compute the evidence of two levels in means over sub-blocks; None with too few of them.
@@ -137,7 +136,7 @@ def switching_evidence(
 
 
 def _is_like_two_levels(
-    courses: TelegraphCourses, variance: Array, present: NDArray[np.bool_], settings: Settings
+    courses: TelegraphCourses, variance: Floats, present: Bools, settings: Settings
 ) -> bool:
     """Return whether the bias is between its levels as rarely as a switching bias.
 
@@ -163,7 +162,7 @@ def _is_like_two_levels(
     )
 
 
-def _count_equal_neighbours(share: Array, min_share: float) -> Array:
+def _count_equal_neighbours(share: Floats, min_share: float) -> Floats:
     """Count neighbouring sub-blocks (record,) with equal shares, between the levels."""
     between = (share > min_share) & (share < 1.0 - min_share)
     return np.asarray(
@@ -173,7 +172,9 @@ def _count_equal_neighbours(share: Array, min_share: float) -> Array:
     )
 
 
-def _sub_block_means(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> tuple[Array, Array, int]:
+def _sub_block_means(
+    data: xr.Dataset, baseline: xr.Dataset, axis: str
+) -> tuple[Floats, Floats, int]:
     """Return means over sub-blocks, their white variance, and how many are merged in each."""
     axis_data, axis_baseline = data.sel(axis=axis), baseline.sel(axis=axis)
     samples = axis_data["sub_block_samples"].values.astype(np.float64)
@@ -198,10 +199,10 @@ def _sub_block_means(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> tuple
 
 def _course_gains(
     courses: TelegraphCourses,
-    values: Array,
-    variance: Array,
-    present: NDArray[np.bool_],
-    given: Array,
+    values: Floats,
+    variance: Floats,
+    present: Bools,
+    given: Floats,
     step: float,
     baseline: xr.Dataset,
 ) -> tuple[float, float]:
@@ -227,7 +228,7 @@ def _course_gains(
 
 
 def _normal_log_likelihood(
-    values: Array, variance: Array, present: NDArray[np.bool_], given: Array
+    values: Floats, variance: Floats, present: Bools, given: Floats
 ) -> float:
     """Return the log likelihood of normal noise of any spectrum, in units of `course_evidence`.
 
@@ -262,7 +263,7 @@ def _normal_log_likelihood(
     return float(best + constant)
 
 
-def _slow_noise_grid(baseline: xr.Dataset) -> tuple[Array, Array, Array]:
+def _slow_noise_grid(baseline: xr.Dataset) -> tuple[Floats, Floats, Floats]:
     """Return the grid's random walks without flicker, the least flicker without walk, and weights.
 
     Their probabilities are those before calibration, because the calibrated noise may be mostly
@@ -275,8 +276,8 @@ def _slow_noise_grid(baseline: xr.Dataset) -> tuple[Array, Array, Array]:
 
 
 def _white_levels(
-    courses: TelegraphCourses, values: Array, variance: Array, present: NDArray[np.bool_]
-) -> Array:
+    courses: TelegraphCourses, values: Floats, variance: Floats, present: Bools
+) -> Floats:
     """Return white levels to try, over the expected one; some from differences of neighbours."""
     pair_present = present[1:] & present[:-1]
     ratios = [1.0, 2.0, 4.0]
@@ -293,7 +294,7 @@ def _white_levels(
     return np.unique(np.maximum(ratios, 1e-12))
 
 
-def switching_powers(share: Array, low: float, high: float, size: int, rate: float) -> Array:
+def switching_powers(share: Floats, low: float, high: float, size: int, rate: float) -> Floats:
     """Compute the band powers within blocks of a bias of two levels, for a step of one.
 
     Frequencies that sub-blocks resolve have the power of the course; higher ones that of switches
@@ -328,7 +329,7 @@ def switching_powers(share: Array, low: float, high: float, size: int, rate: flo
     )
 
 
-def _course_by_sample(share: Array, chosen_blocks: slice, size: int) -> Array:
+def _course_by_sample(share: Floats, chosen_blocks: slice, size: int) -> Floats:
     """Return the course of some blocks by sample; it meets the levels at both sub-block ends."""
     pieces = share.shape[1]
     flat = np.clip(share.ravel(), 0.0, 1.0)

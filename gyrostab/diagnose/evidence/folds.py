@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
+
+from gyrostab.arrays import Bools
 
 #: Folds of each length; consecutive intervals belong to them in turn.
 FOLDS = 4
@@ -44,7 +45,7 @@ def fold_blocks(blocks: xr.Dataset) -> xr.DataArray:
     )
 
 
-def fold_subsets(fold: xr.DataArray) -> NDArray[np.bool_]:
+def fold_subsets(fold: xr.DataArray) -> Bools:
     """Return the blocks used (1 + lengths * FOLDS, block): all, then all but each fold.
 
     The folds of a length follow each other.

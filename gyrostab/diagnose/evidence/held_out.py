@@ -21,11 +21,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks, fold_subsets
 from gyrostab.diagnose.evidence.products import (
-    Array,
     Products,
     axis_noise,
     column_pairs,
@@ -45,7 +44,7 @@ from gyrostab.diagnose.reduce.schema import axis_values
 Tier = Literal["free", "calibrated"]
 
 
-def _number_columns(designs: Sequence[Array]) -> list[NDArray[np.int64]]:
+def _number_columns(designs: Sequence[Floats]) -> list[Ints]:
     """Return the indices of the columns of each design, the last dimension, among those of all."""
     ends = np.cumsum([design.shape[-1] for design in designs])
     return [
@@ -53,14 +52,14 @@ def _number_columns(designs: Sequence[Array]) -> list[NDArray[np.int64]]:
     ]
 
 
-def mean_residual(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> Array:
+def mean_residual(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> Floats:
     """Return the block means of an axis less those of known effects, (block, record)."""
     mean = data.variables["mean"].isel(axis=data["axis"].values.tolist().index(axis))
     by_record = mean.transpose("block", ...).values.reshape(data.sizes["block"], -1)
     return np.asarray(by_record - axis_values(baseline, "known_mean", axis)[:, None])
 
 
-def noise_weight(baseline: xr.Dataset, axis: str, tier: Tier) -> Array:
+def noise_weight(baseline: xr.Dataset, axis: str, tier: Tier) -> Floats:
     """Return the log weights of the grid of K and B, (grid,)."""
     name = "grid_prior" if tier == "free" else "grid_calibrated"
     return np.asarray(axis_values(baseline, name, axis), dtype=np.float64)
@@ -69,14 +68,14 @@ def noise_weight(baseline: xr.Dataset, axis: str, tier: Tier) -> Array:
 def mean_factors(
     data: xr.Dataset,
     baseline: xr.Dataset,
-    designs: Sequence[Array],
+    designs: Sequence[Floats],
     *,
     axis: str,
     tier: Tier = "free",
-    given: Array | None = None,
+    given: Floats | None = None,
     folds: xr.DataArray | None = None,
     wander: RandomProcesses | None = None,
-) -> Array:
+) -> Floats:
     """Compute factors of designs in the block means of an axis, one record or many of equal gaps.
 
     Parameters
@@ -133,13 +132,13 @@ def mean_factors(
 
 def _factors_by_subset(
     by_subset: Iterable[Products],
-    precision: Array,
-    designs: Sequence[NDArray[np.int64]],
-    limits: Array,
-    log_weight: Array,
-    widths: Array,
+    precision: Floats,
+    designs: Sequence[Ints],
+    limits: Floats,
+    log_weight: Floats,
+    widths: Floats,
     is_bounded: Sequence[bool] = (),
-) -> Array:
+) -> Floats:
     """Return the factors of designs from products, whose last columns have this prior precision."""
     out = np.stack(
         [
@@ -158,7 +157,7 @@ def _factors_by_subset(
     return out
 
 
-def noise_columns(baseline: xr.Dataset, *, axis: str) -> tuple[Array, Array, Array]:
+def noise_columns(baseline: xr.Dataset, *, axis: str) -> tuple[Floats, Floats, Floats]:
     """Return the relative change of the spectrum per noise coefficient, with prior and least size.
 
     N may take any value; Q changes by its value and error, B and K by three times that, because the
@@ -193,23 +192,23 @@ def noise_columns(baseline: xr.Dataset, *, axis: str) -> tuple[Array, Array, Arr
 class LinearModel(NamedTuple):
     """A linear model of data that are independent from cell to cell."""
 
-    values: Array  # (block, cell, record)
-    weight: Array  # (block, cell): one over the variance; 0 for no data
-    designs: list[Array]  # (block, cell, column) each
-    given: Array  # (block, cell, column): columns in the model with and without a design
+    values: Floats  # (block, cell, record)
+    weight: Floats  # (block, cell): one over the variance; 0 for no data
+    designs: list[Floats]  # (block, cell, column) each
+    given: Floats  # (block, cell, column): columns in the model with and without a design
     #: (column, column): for the given columns; negative on the diagonal for a nearly free column,
     #: whose precision is taken from the data.
-    precision: Array
+    precision: Floats
     is_bounded: Sequence[bool] = ()  # for each design, whether its sizes cannot be negative
-    low: Array = np.empty(0)  # (column,): least sizes of the given columns
+    low: Floats = np.empty(0)  # (column,): least sizes of the given columns
 
-    def usable_weight(self) -> Array:
+    def usable_weight(self) -> Floats:
         """Return the weight, 0 where it is unknown or a record has no value."""
         usable = np.isfinite(self.weight) & np.isfinite(self.values).all(axis=2)
         return np.where(usable, self.weight, 0.0)
 
 
-def with_independent_cells(model: LinearModel, common: Array, unit: Array) -> LinearModel:
+def with_independent_cells(model: LinearModel, common: Floats, unit: Floats) -> LinearModel:
     """Transform a model whose cells vary together to independent cells; `remove_common_part`."""
     weight = model.usable_weight()
     present = weight[..., None] > 0.0
@@ -220,7 +219,7 @@ def with_independent_cells(model: LinearModel, common: Array, unit: Array) -> Li
     return model._replace(values=values, weight=weight, designs=designs, given=given)
 
 
-def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Array:
+def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Floats:
     """Compute factors of designs in independent cells, in the shape of `mean_factors`."""
     records = model.values.shape[2]
     weight = model.usable_weight()
@@ -258,7 +257,7 @@ def _sum_products(products: Sequence[Products]) -> Products:
     return Products(*(reduce(np.add, arrays) for arrays in zip(*products, strict=True)))
 
 
-def _fill_free_precision(precision: Array, square: Array, width: float) -> Array:
+def _fill_free_precision(precision: Floats, square: Floats, width: float) -> Floats:
     """Return precisions of given columns, negative ones replaced by a prior of this width."""
     diagonal = np.diagonal(precision)
     free = np.where(square > 0.0, square, 1.0) / width**2

@@ -5,32 +5,30 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.products import Products
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Mixture:
     """A mixture of normal distributions of some sizes."""
 
-    log_weight: Array  # (point,): not normalised
-    mean: Array  # (point, size)
-    covariance: Array  # (point, size, size)
+    log_weight: Floats  # (point,): not normalised
+    mean: Floats  # (point, size)
+    covariance: Floats  # (point, size, size)
 
     @property
     def evidence(self) -> float:
         """Log likelihood over all points, up to a constant."""
         return float(np.logaddexp.reduce(self.log_weight))
 
-    def weights(self) -> Array:
+    def weights(self) -> Floats:
         """Return the probabilities of the points."""
         return np.asarray(np.exp(self.log_weight - np.logaddexp.reduce(self.log_weight)))
 
-    def quantiles(self, tail: float) -> Array:
+    def quantiles(self, tail: float) -> Floats:
         """Return the quantiles of each size at `tail` and ``1 - tail``, shape (2, size).
 
         NaN for a size that is not determined.
@@ -56,7 +54,7 @@ class Mixture:
             ends.append(0.5 * (below + above))
         return np.array(ends)
 
-    def moments(self) -> tuple[Array, Array]:
+    def moments(self) -> tuple[Floats, Floats]:
         """Return mean and covariance of the mixture."""
         weight = self.weights()
         mean = weight @ self.mean
@@ -66,7 +64,7 @@ class Mixture:
         )
 
 
-def products_mixture(products: Products, log_weight: Array, *, ridge: float = 1e-9) -> Mixture:
+def products_mixture(products: Products, log_weight: Floats, *, ridge: float = 1e-9) -> Mixture:
     """Return the sizes of free columns at each point of a grid, from the products of one record.
 
     `log_weight` (point,) is the log prior of the grid, `ridge` the share of the trace of the Gram

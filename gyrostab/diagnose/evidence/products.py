@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.diagnose.evidence.folds import FOLDS
 from gyrostab.diagnose.evidence.wandering import RandomProcesses, expected_processes, no_processes
 from gyrostab.diagnose.reduce.schema import axis_values
@@ -17,7 +17,6 @@ from gyrostab.kernels.regression.evidence import mixed_evidence, row_products
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
 #: Standard deviations of the prior of a factor, in units of its error in white noise. Design
 #: choice: a mixture over three decades needs no prior size.
 WIDTHS = (1.0, 10.0, 100.0, 1000.0)
@@ -33,13 +32,13 @@ _MAX_PRODUCTS_AT_ONCE = 100_000  # designs times records times grid points; limi
 class Products(NamedTuple):
     """Products of whitened data y and columns x on some blocks; without a grid, one grid point."""
 
-    square: Array  # (grid, record): y' y
-    cross: Array  # (grid, column, record): x' y
-    gram: Array  # (grid, column, column): x' x
-    log_determinant: Array  # (grid,): of the covariance
+    square: Floats  # (grid, record): y' y
+    cross: Floats  # (grid, column, record): x' y
+    gram: Floats  # (grid, column, column): x' x
+    log_determinant: Floats  # (grid,): of the covariance
 
 
-def prior_widths(square: Array) -> Array:
+def prior_widths(square: Floats) -> Floats:
     """Return `WIDTHS`, with the last one as large as any factor of data with these squares can be.
 
     Examples
@@ -51,7 +50,7 @@ def prior_widths(square: Array) -> Array:
     return np.array([*WIDTHS[:-1], np.clip(largest, WIDTHS[-1], _MAX_WIDTH)])
 
 
-def marginalise(products: Products, given: int, precision: Array) -> Products:
+def marginalise(products: Products, given: int, precision: Floats) -> Products:
     """Marginalise the last `given` columns, with normal priors of this precision (given, given)."""
     if not given:
         return products
@@ -70,7 +69,7 @@ def marginalise(products: Products, given: int, precision: Array) -> Products:
     )
 
 
-def factor_errors(before: Array, after: Array) -> Array:
+def factor_errors(before: Floats, after: Floats) -> Floats:
     """Return the error of every factor in white noise [1 / unit of its column], 0 if invisible.
 
     `before` and `after` are the squares of the columns, without and with the constant and the given
@@ -90,7 +89,7 @@ def axis_noise(baseline: xr.Dataset, axis: str) -> dict[str, Any]:
     }
 
 
-def scale_columns(columns: Array | None, count: int) -> Array:
+def scale_columns(columns: Floats | None, count: int) -> Floats:
     """Return columns (count, column) over their largest size, 0 where missing; none for None."""
     if columns is None:
         return np.empty((count, 0))
@@ -100,15 +99,15 @@ def scale_columns(columns: Array | None, count: int) -> Array:
 
 
 def mean_products(
-    values: Array,
-    columns: Array,
+    values: Floats,
+    columns: Floats,
     *,
-    variance: Array,
+    variance: Floats,
     step: float,
-    K: Array,
-    B: Array,
-    present: NDArray[np.bool_],
-    pairs: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None,
+    K: Floats,
+    B: Floats,
+    present: Bools,
+    pairs: tuple[Ints, Ints] | None = None,
     wander: RandomProcesses | None = None,
 ) -> Products:
     """Compute products of block means and columns, whitened for every pair of K and B.
@@ -153,9 +152,7 @@ def mean_products(
     return Products(square, cross, gram, determinant)
 
 
-def column_pairs(
-    width: int, designs: Sequence[NDArray[np.int64]], given: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def column_pairs(width: int, designs: Sequence[Ints], given: int) -> tuple[Ints, Ints]:
     """Return the pairs of columns that meet in a model.
 
     Each column meets itself, the columns of its design, and the last `given` columns.
@@ -168,7 +165,7 @@ def column_pairs(
     return first, second
 
 
-def power_products(residual: Array, weight: Array, columns: Array) -> Products:
+def power_products(residual: Floats, weight: Floats, columns: Floats) -> Products:
     """Compute products of data (cell, record) and columns (cell, column) in independent cells.
 
     The weight (cell,) is 0 for no data, where the data may have any finite value.
@@ -180,7 +177,7 @@ def power_products(residual: Array, weight: Array, columns: Array) -> Products:
     )
 
 
-def remove_common_part(values: Array, weight: Array, common: Array, unit: Array) -> Array:
+def remove_common_part(values: Floats, weight: Floats, common: Floats, unit: Floats) -> Floats:
     """Subtract the common part of the cells of each block, so that they become independent.
 
     Under random gaps the powers of all bands of a block vary together: their covariance is ``1 /
@@ -210,12 +207,12 @@ def remove_common_part(values: Array, weight: Array, common: Array, unit: Array)
 
 def log_evidence(
     products: Products,
-    designs: Sequence[NDArray[np.int64]],
-    limits: Array,
-    log_weight: Array,
-    widths: Array,
+    designs: Sequence[Ints],
+    limits: Floats,
+    log_weight: Floats,
+    widths: Floats,
     is_bounded: Sequence[bool] = (),
-) -> Array:
+) -> Floats:
     """Compute the log marginal likelihood without any design, and with each, (1 + design, record).
 
     A design is the indices of its columns, and may have factors that cannot be negative. The limits
@@ -248,12 +245,12 @@ def log_evidence(
 
 def _equal_size_evidence(
     products: Products,
-    chosen: NDArray[np.int64],
-    limits: Array,
-    base: Array,
-    widths: Array,
+    chosen: Ints,
+    limits: Floats,
+    base: Floats,
+    widths: Floats,
     is_bounded: bool,
-) -> Array:
+) -> Floats:
     """Compute log marginal likelihoods (design, record) of designs (design, column)."""
     scale = limits[chosen]
     gram = products.gram[:, chosen[:, :, None], chosen[:, None, :]] * (
@@ -277,8 +274,8 @@ def _equal_size_evidence(
 
 
 def _bounded_evidence(
-    base: Array, rotated: Array, eigenvalues: Array, vectors: Array, widths: Array
-) -> Array:
+    base: Floats, rotated: Floats, eigenvalues: Floats, vectors: Floats, widths: Floats
+) -> Floats:
     """Compute the log marginal likelihoods (design, record) of factors that cannot be negative.
 
     Their prior is the positive half of the normal one. The likelihood changes by the share of the
@@ -303,11 +300,11 @@ def _bounded_evidence(
 
 
 def held_out_evidence(
-    factors: Array,
-    owner: Sequence[int] | NDArray[np.int64],
+    factors: Floats,
+    owner: Sequence[int] | Ints,
     *,
-    weight: Sequence[float] | Array | None = None,
-) -> Array:
+    weight: Sequence[float] | Floats | None = None,
+) -> Floats:
     """Compute the held-out evidence (candidate, record), the largest over the fold lengths [nats].
 
     It is the sum over the folds of the log Bayes factor on all blocks minus that without the fold.

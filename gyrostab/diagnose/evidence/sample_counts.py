@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from gyrostab.arrays import Array, Bools, Floats
 from gyrostab.diagnose.evidence.folds import FOLDS
 
-Array = NDArray[Any]
 #: Counts that effects raise.
 COUNTS = ("outliers", "repeats", "extremes", "stuck", "filled")
 #: What null records have by chance.
@@ -33,7 +31,7 @@ _CERTAIN_EXTREMES = 2  # the smallest and the largest sample of any record
 _PRIOR_SHAPE, _PRIOR_RATE = 0.5, 0.05
 
 
-def has_coarse_grid(blocks: xr.Dataset) -> NDArray[np.bool_]:
+def has_coarse_grid(blocks: xr.Dataset) -> Bools:
     """Find the axes (axis,) with so coarse a quantization grid that it alone causes `GRID_COUNTS`.
 
     Examples
@@ -51,7 +49,7 @@ def has_coarse_grid(blocks: xr.Dataset) -> NDArray[np.bool_]:
     )
 
 
-def hidden_by_grid(blocks: xr.Dataset, name: str) -> NDArray[np.bool_]:
+def hidden_by_grid(blocks: xr.Dataset, name: str) -> Bools:
     """Find the axes (axis,) on which a coarse grid alone causes a count or the kurtosis.
 
     Repeats and zeros remain usable where noise is normal: null records then have as many.
@@ -68,7 +66,7 @@ def hidden_by_grid(blocks: xr.Dataset, name: str) -> NDArray[np.bool_]:
     )
 
 
-def quiescent_scatter(blocks: xr.Dataset) -> NDArray[np.float64]:
+def quiescent_scatter(blocks: xr.Dataset) -> Floats:
     """Return the scatter of the samples of every axis at rest [degree hour-1]; inf if unknown."""
     width = blocks["band_high"].values - blocks["band_low"].values
     power = blocks["power"].transpose("axis", ..., "band").values
@@ -76,13 +74,13 @@ def quiescent_scatter(blocks: xr.Dataset) -> NDArray[np.float64]:
     return np.sqrt(_finite_quantile(square, _QUIESCENT_QUANTILE))
 
 
-def _finite_quantile(values: NDArray[Any], share: float) -> NDArray[np.float64]:
+def _finite_quantile(values: Array, share: float) -> Floats:
     """Return the quantile of the finite values of each row, inf without any."""
     finite = [row[np.isfinite(row)] for row in values]
     return np.array([np.quantile(row, share) if row.size else np.inf for row in finite])
 
 
-def excess_extremes(values: NDArray[Any]) -> NDArray[Any]:
+def excess_extremes(values: Array) -> Array:
     """Count samples at the ends of the range, without the first two of the record.
 
     Every record has a smallest and a largest sample. A count of which two are certain is not
@@ -138,10 +136,10 @@ class CountEvidence:
     """
 
     of: dict[str, tuple[Array, Array]]
-    rounded: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    rounded: Bools = field(default_factory=lambda: np.zeros(0, np.bool_))
 
     @classmethod
-    def gathered(cls, nulls: Sequence[xr.Dataset], rounded: NDArray[np.bool_]) -> CountEvidence:
+    def gathered(cls, nulls: Sequence[xr.Dataset], rounded: Bools) -> CountEvidence:
         """Compute the expected counts from all null records."""
         moments = {}
         for name in EXPECTED:
@@ -180,9 +178,7 @@ def _best_held_out(evidence: Array) -> Array:
     return np.asarray(gain.reshape(*gain.shape[:-1], -1, FOLDS).sum(axis=-1).max(axis=-1))
 
 
-def sample_count_evidence(
-    values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]
-) -> Array:
+def sample_count_evidence(values: Array, mean: Array, spread: Array, subsets: Bools) -> Array:
     """Compute the held-out evidence (record, axis) of a raised count (record, axis, block).
 
     Mean (axis, block) and spread (axis,) are from `expected_counts`, subsets from `fold_subsets`.
@@ -191,9 +187,7 @@ def sample_count_evidence(
     return _best_held_out(_log_ratio(count, expected))
 
 
-def kurtosis_evidence(
-    values: Array, mean: Array, spread: Array, subsets: NDArray[np.bool_]
-) -> Array:
+def kurtosis_evidence(values: Array, mean: Array, spread: Array, subsets: Bools) -> Array:
     """Compute the held-out evidence of a higher kurtosis, as `sample_count_evidence`.
 
     `mean` and `spread` are those of a block, (axis,).

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Bools
 from gyrostab.diagnose.evidence.folds import FOLDS
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import EDGE_LINES, LEAK_LINES, level_around, local_level
 
-Array = NDArray[Any]
 _MIN_LEVEL_RATIO = 1e-3  # of the spectrum, that known lines leave; design choice
 _MAX_SKIRT_LINES = 40  # design choice
 _POWERS_AT_ONCE = 100_000  # of null records; so many fit in the cache of a processor
@@ -83,9 +80,7 @@ def mean_line_power(blocks: xr.Dataset, axis: str) -> tuple[Array, float]:
     return (power[good] * weight[good, None]).sum(axis=0) / max(count, 1e-300), count
 
 
-def line_skirt(
-    blocks: xr.Dataset, axis: str, place: int, settings: Settings = DEFAULTS
-) -> NDArray[np.bool_]:
+def line_skirt(blocks: xr.Dataset, axis: str, place: int, settings: Settings = DEFAULTS) -> Bools:
     """Find the lines that belong to the one at `place`: its leakage and its skirt.
 
     The skirt extends on both sides until the power falls to the level. A line with a wandering

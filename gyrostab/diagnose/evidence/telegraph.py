@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.diagnose.evidence.held_out import mean_residual
 from gyrostab.diagnose.evidence.mixture import products_mixture
 from gyrostab.diagnose.evidence.products import (
@@ -40,7 +40,6 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.regression.evidence import mixed_evidence
 from gyrostab.kernels.regression.levels import level_tables, levels_smooth
 
-Array = NDArray[np.float64]
 #: Parts of a block, each on one level. Design choice.
 PARTS_PER_BLOCK = 4
 _MIN_TIME_BLOCKS = 0.5  # shortest mean time on a level
@@ -56,21 +55,21 @@ _HEIGHT_SCATTER = 0.5  # of an arbitrary course over its step; design choice
 class TelegraphCourses(NamedTuple):
     """Biases of two levels, one for every record, which is the first dimension."""
 
-    share: Array  # (record, block): share of each block on the upper level
-    spread: Array  # (record, block): its variance
-    step: Array  # upper minus lower level [degree hour-1]
-    times: Array  # (record, 2): mean times on the lower and on the upper level [blocks]
-    switch_count: Array  # expected number of switches
-    cost: Array  # of specifying the course [nats]
-    log: Array  # log likelihood of the means, including white noise
-    scale: Array  # scatter over the expected white variance
+    share: Floats  # (record, block): share of each block on the upper level
+    spread: Floats  # (record, block): its variance
+    step: Floats  # upper minus lower level [degree hour-1]
+    times: Floats  # (record, 2): mean times on the lower and on the upper level [blocks]
+    switch_count: Floats  # expected number of switches
+    cost: Floats  # of specifying the course [nats]
+    log: Floats  # log likelihood of the means, including white noise
+    scale: Floats  # scatter over the expected white variance
 
 
 def telegraph_courses(
-    values: Array,
-    variance: Array,
-    present: NDArray[np.bool_],
-    columns_given: Array,
+    values: Floats,
+    variance: Floats,
+    present: Bools,
+    columns_given: Floats,
     *,
     starts: Sequence[tuple[float, float]] = START_QUANTILES,
     min_scatter: float = 1.0,
@@ -119,20 +118,20 @@ def telegraph_courses(
 class _Fit(NamedTuple):
     """State of the fit by record."""
 
-    size: Array  # (record, column): sizes of the columns and of the step
-    times: Array  # (record, 2): mean times
-    scale: Array  # (record,): scale of the noise
+    size: Floats  # (record, column): sizes of the columns and of the step
+    times: Floats  # (record, 2): mean times
+    scale: Floats  # (record,): scale of the noise
     parts: int = PARTS_PER_BLOCK  # of a block
 
 
-def _select_by_record(arrays: Sequence[Array], chosen: NDArray[np.int64]) -> Array:
+def _select_by_record(arrays: Sequence[Floats], chosen: Ints) -> Floats:
     """Select for each record one of several arrays over records."""
     return np.asarray(np.stack(arrays)[chosen, np.arange(chosen.size)])
 
 
 def _smooth_courses(
-    fit: _Fit, y: Array, weight: Array, columns_given: Array
-) -> tuple[Array, Array, Array, Array, Array]:
+    fit: _Fit, y: Floats, weight: Floats, columns_given: Floats
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Return log likelihood, share and its square, steps up, and sum of weighted squares."""
     residual = y - fit.size[:, :-1] @ columns_given.T
     step = fit.size[:, -1]
@@ -155,8 +154,8 @@ def _smooth_courses(
 
 
 def _maximise(
-    fit: _Fit, y: Array, weight: Array, columns_given: Array, rounds: int, min_scatter: float
-) -> tuple[_Fit, Array]:
+    fit: _Fit, y: Floats, weight: Floats, columns_given: Floats, rounds: int, min_scatter: float
+) -> tuple[_Fit, Floats]:
     """Iterate expectation and maximisation until convergence; return also the log likelihood."""
     n, count = y.shape[1], int((weight > 0.0).sum())
     tolerance = _CONVERGED / np.sqrt(np.median(weight[weight > 0.0]))
@@ -190,7 +189,7 @@ def _maximise(
     return fit, log
 
 
-def _make_courses(fit: _Fit, y: Array, weight: Array, columns_given: Array) -> TelegraphCourses:
+def _make_courses(fit: _Fit, y: Floats, weight: Floats, columns_given: Floats) -> TelegraphCourses:
     """Return the courses of a fit, with the upper level above the lower one."""
     log, share, square, up, total = _smooth_courses(fit, y, weight, columns_given)
     present = weight > 0.0
@@ -216,13 +215,13 @@ def _make_courses(fit: _Fit, y: Array, weight: Array, columns_given: Array) -> T
 
 def simulated_courses(
     courses: TelegraphCourses,
-    variance: Array,
-    present: NDArray[np.bool_],
+    variance: Floats,
+    present: Bools,
     *,
     parts: int,
     count: int,
     rng: np.random.Generator,
-) -> tuple[Array, Array]:
+) -> tuple[Floats, Floats]:
     """Simulate `count` records of two levels with the parameters of one record.
 
     Return log likelihoods (record,) and shares (record, block).
@@ -238,7 +237,7 @@ def simulated_courses(
     )[:2]
 
 
-def _simulate_course(n: int, low: float, high: float, rng: np.random.Generator) -> Array:
+def _simulate_course(n: int, low: float, high: float, rng: np.random.Generator) -> Floats:
     """Simulate the share of n blocks on the upper level, for mean times on both levels [blocks]."""
     first = int(rng.random() < high / (low + high))
     pairs = 16 + int(2.0 * n / (low + high))
@@ -251,7 +250,7 @@ def _simulate_course(n: int, low: float, high: float, rng: np.random.Generator) 
     return np.diff(np.interp(np.arange(n + 1.0), at, up))
 
 
-def _time_cost(switch_count: Array, block_count: int) -> Array:
+def _time_cost(switch_count: Floats, block_count: int) -> Floats:
     """Return the cost of both unknown mean times [nats].
 
     The logarithm of each is known to one over the root of its switches.
@@ -267,9 +266,9 @@ def telegraph_evidence(
     baseline: xr.Dataset,
     *,
     axis: str,
-    given: Array | None = None,
+    given: Floats | None = None,
     settings: Settings = DEFAULTS,
-) -> tuple[Array, TelegraphCourses]:
+) -> tuple[Floats, TelegraphCourses]:
     """Compute the evidence of a bias of two levels on an axis, and its course.
 
     The evidence (record,) is a lower bound of the log Bayes factor [nats], -inf with fewer than
@@ -299,18 +298,18 @@ def telegraph_evidence(
     return _select_by_record(evidence_nats, chosen), best
 
 
-def drift_waves(n: int, count: int) -> Array:
+def drift_waves(n: int, count: int) -> Floats:
     """Return a constant and `count` slow cosines, (n, 1 + count), that approximate a drift."""
     return np.asarray(np.cos(np.pi * (np.arange(n)[:, None] + 0.5) / n * np.arange(count + 1)))
 
 
 def _course_evidence_by_record(
     courses: TelegraphCourses,
-    values: Array,
-    given: Array,
+    values: Floats,
+    given: Floats,
     setup: dict[str, Any],
-    log_weight: Array,
-) -> Array:
+    log_weight: Floats,
+) -> Floats:
     """Return the evidence of the courses minus their cost; their scatter counts as a datum."""
     records, columns_given = values.shape[1], given.shape[1]
     columns = np.concatenate([courses.share.T, given], axis=1)
@@ -333,7 +332,7 @@ def _course_evidence_by_record(
 
 
 def course_evidence(
-    products: Products, place: int, scatter: float, log_weight: Array, *, unit: float
+    products: Products, place: int, scatter: float, log_weight: Floats, *, unit: float
 ) -> tuple[float, float]:
     """Compute log evidences without and with a course, averaged over a noise grid.
 
@@ -358,10 +357,10 @@ class Visits(NamedTuple):
     #: blocks, whose heights cannot be known.
     unequal_nats: float
     switch_count: int  # between visits that have more than half of some block or part
-    columns: Array  # (column, block): visits to the level whose heights differ more
+    columns: Floats  # (column, block): visits to the level whose heights differ more
 
 
-def visit_columns(share: Array) -> Array:
+def visit_columns(share: Floats) -> Floats:
     """Split the share of each block on a level into the visits to it, (visit, block).
 
     A visit has more than half of some block. What is left between two visits belongs to the nearer.
@@ -381,13 +380,13 @@ def visit_columns(share: Array) -> Array:
 
 
 def compare_visits(
-    mean: Array,
+    mean: Floats,
     baseline: xr.Dataset,
-    share: Array,
+    share: Floats,
     *,
     axis: str,
     block_s: float,
-    given: Array | None = None,
+    given: Floats | None = None,
 ) -> Visits:
     """Compute the evidence that the visits to one of the levels have different heights.
 
@@ -434,10 +433,10 @@ def compare_visits(
 
 def _log_evidence(
     products: Products,
-    chosen: NDArray[np.int64],
+    chosen: Ints,
     base_count: int,
     variance: float,
-    log_weight: Array,
+    log_weight: Floats,
 ) -> tuple[float, float]:
     """Return the log evidence of columns, with a prior beyond `base_count`; and the step."""
     part = products._replace(

@@ -13,21 +13,19 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.kernels.spectra.expected import interval_variance
-
-Array = NDArray[np.float64]
 
 
 class RandomProcesses(NamedTuple):
     """Random processes in the means of an axis in addition to flicker and random walk noise."""
 
-    square: Array  # (process,): variances of exponentially correlated processes [degree2 hour-2]
-    time: Array  # (process,): their correlation times [s]
-    walk: Array  # (block,): growth of the variance of random walks [degree2 hour-2 s-1]
-    angle: Array  # (): variance of the angle where blocks meet [arcsec2]
+    square: Floats  # (process,): variances of exponentially correlated processes [degree2 hour-2]
+    time: Floats  # (process,): their correlation times [s]
+    walk: Floats  # (block,): growth of the variance of random walks [degree2 hour-2 s-1]
+    angle: Floats  # (): variance of the angle where blocks meet [arcsec2]
 
 
 def expected_processes(baseline: xr.Dataset, axis: str | int) -> RandomProcesses:
@@ -58,7 +56,7 @@ def add_correlated(processes: RandomProcesses, square: float, time: float) -> Ra
 
 
 def with_process(
-    baseline: xr.Dataset, axis: str, variance: Array, time: float = np.inf
+    baseline: xr.Dataset, axis: str, variance: Floats, time: float = np.inf
 ) -> xr.Dataset:
     """Return the baseline with another random process in the mean of an axis.
 
@@ -88,7 +86,7 @@ def with_process(
     )
 
 
-def allan_variance(tau: float, time: Array) -> Array:
+def allan_variance(tau: float, time: Floats) -> Floats:
     """Return the Allan variance at `tau` [s] of unit processes with correlation `time` [s].
 
     It is the variance of a mean over `tau` less the covariance of two adjacent means. IEEE Std

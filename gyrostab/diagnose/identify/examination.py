@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.diagnose.baseline.quantization_grid import rounded_rates
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import EXPECTED, CountEvidence, has_coarse_grid
@@ -37,7 +36,6 @@ NUISANCE_ALTERNATIVES = {
     "~cov": "the axes have noise in common",
     "~red": "the bias wanders far beyond its noise",
 }
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

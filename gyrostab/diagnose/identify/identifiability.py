@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
@@ -26,7 +26,6 @@ from gyrostab.physics.registry import effects
 
 #: Number of time shifts at most, the recorded time among them: ten make the allowed share of 5 %.
 TIME_SHIFTS = 200
-Array = NDArray[np.float64]
 _PPM = 1e6  # in one
 _MIN_EIGENVALUE = 1e-12  # of a correlation; above rounding errors
 
@@ -158,7 +157,7 @@ def _is_in_range(component: Component, state: State) -> bool:
     return distance_to_range(sizes, covariance, low, high) <= state.settings.clear_sigma
 
 
-def distance_to_range(sizes: Array, covariance: Array, low: Array, high: Array) -> float:
+def distance_to_range(sizes: Floats, covariance: Floats, low: Floats, high: Floats) -> float:
     """Return how far sizes are from a range of all together, in standard errors.
 
     Sizes of columns that resemble each other have large errors, although their sum is well known.
@@ -336,7 +335,7 @@ def _compute_shifted_evidence(
     surrogates: Sequence[Variant | None],
     state: State,
     folds: xr.DataArray,
-) -> Array:
+) -> Floats:
     """Return the evidence of the channel, then of each surrogate, on the axis of a component.
 
     The channel has all variants: it pays for the search of the best one, as no surrogate has to.

@@ -5,16 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gyrostab.diagnose.identify.components import are_lines, axes_of, sum_evidence
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on_components, refit_weights
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
-Array = NDArray[np.float64]
 #: What filters the noise of the log, and would explain an error in the spectrum of another effect.
 _FILTER = "logger_filter"
 

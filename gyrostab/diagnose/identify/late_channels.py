@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination, Identifications
 from gyrostab.diagnose.identify.identification import Selection
@@ -30,7 +30,6 @@ _MIN_RECORD_DELAYS = 6
 #: Delays too large for a clock with which the best one is compared; limits the time.
 _MAX_OTHER_DELAYS = 64
 _QUANTILES = 1000  # over which a probability is averaged; exact to 1e-3
-Array = NDArray[np.float64]
 
 
 def find_late_channel(
@@ -163,7 +162,7 @@ class DelaySearch:
         ratio = best.nats / max(float(nats), 1.0)
         return chance_of_best(ratio, count, number) <= settings.surrogate_share
 
-    def parts(self, channel: str) -> Array:
+    def parts(self, channel: str) -> Floats:
         """Return the channel in parts of the blocks; the mean square where the rms matters."""
         blocks = self.examination.start.blocks
         count, samples = blocks.sizes["block"], int(blocks.attrs["block_samples"])
@@ -177,8 +176,8 @@ class DelaySearch:
         return means**2 if is_rms_channel(channel) else means
 
     def evidence(
-        self, channel: str, parts: Array, shifts: Iterable[int], *, wrap: bool = False
-    ) -> Array:
+        self, channel: str, parts: Floats, shifts: Iterable[int], *, wrap: bool = False
+    ) -> Floats:
         """Return the evidence of the effect that follows a channel best, moved by parts [nats].
 
         With `wrap`, the channel moves round the record, end to start.
@@ -211,7 +210,7 @@ class DelaySearch:
         return np.array(best)
 
 
-def _correlate_with_itself(parts: Array, shifts: NDArray[np.int64]) -> Array:
+def _correlate_with_itself(parts: Floats, shifts: Ints) -> Floats:
     """Return the correlations of a channel with itself, moved round the record by parts."""
     centred = np.nan_to_num(parts - np.nanmean(parts))
     spectrum = np.abs(np.fft.rfft(centred)) ** 2

@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.baseline.posterior import visible_coefficients
 from gyrostab.diagnose.evidence.mixture import products_mixture
 from gyrostab.diagnose.evidence.products import mean_products
@@ -22,8 +22,6 @@ from gyrostab.diagnose.identify.identification import (
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import Settings
-
-Array = NDArray[np.float64]
 
 #: Arbitrary courses of the bias.
 _DRIFTS = ("~bias(t)", "~levels", "~red")
@@ -208,7 +206,7 @@ def variance_fluctuation(state: State, axis: str) -> float:
     return float(np.logaddexp.reduce(log[1:]) - np.log(log.size - 1) - log[0])
 
 
-def _power_levels(state: State, row: int, axis: str) -> tuple[Array, Array, Array]:
+def _power_levels(state: State, row: int, axis: str) -> tuple[Floats, Floats, Floats]:
     """Return level and variance of each block, and what changes of size of the effects do to them.
 
     The level is relative to the expected one, less 1.

@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS, Statistic, find_statistic
 from gyrostab.diagnose.statistics.mean import region_mean
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 
-Array = NDArray[np.float64]
 #: Fields of a place where recording and simulation differ: ``statistic``, ``view``, ``axes``
 #: (separated by blanks), ``what``, ``begin``, ``end`` [s since the start], ``tau_min_s``,
 #: ``tau_max_s`` [s], ``frequency`` [Hz], ``sign`` (0 for a mean that wanders), ``z``, ``ratio``
@@ -120,8 +119,8 @@ def _take_region(
     statistic: Statistic,
     scores: xr.Dataset,
     row: int,
-    remaining: Array,
-    z: Array,
+    remaining: Floats,
+    z: Floats,
     null: NullScores,
     level: float,
 ) -> Region | None:
@@ -165,8 +164,8 @@ def _take_region(
 
 
 def _find_span(
-    scores: xr.Dataset, z: Array, window: int, settings: Settings
-) -> tuple[float, float, NDArray[np.int64]]:
+    scores: xr.Dataset, z: Floats, window: int, settings: Settings
+) -> tuple[float, float, Ints]:
     """Return begin and end of the time about a window that explains most of a column.
 
     It is the run of the shortest windows with the largest sum over the root of their number. The
@@ -206,9 +205,7 @@ def _find_span(
     return float(begin[chosen[0]]), float(end[chosen[-1]]), chosen
 
 
-def _disjoint_windows(
-    first: NDArray[np.int64], stop: NDArray[np.int64], usable: NDArray[np.int64]
-) -> NDArray[np.int64]:
+def _disjoint_windows(first: Ints, stop: Ints, usable: Ints) -> Ints:
     """Return the shortest windows in order, without those that overlap the one before."""
     shortest = usable[(stop - first)[usable] == (stop - first)[usable].min()]
     chosen, until = [], -1
@@ -220,8 +217,8 @@ def _disjoint_windows(
 
 
 def _combine_windows(
-    scores: xr.Dataset, row: int, z: Array, fine: NDArray[np.int64], window: int
-) -> tuple[Array, Array]:
+    scores: xr.Dataset, row: int, z: Floats, fine: Ints, window: int
+) -> tuple[Floats, Floats]:
     """Return scores and ratios of every column over the span.
 
     A column without short windows has those of the window itself.
@@ -239,11 +236,11 @@ def _combine_windows(
 def _find_columns(
     statistic: Statistic,
     scores: xr.Dataset,
-    combined: Array,
-    ratio: Array,
+    combined: Floats,
+    ratio: Floats,
     column: int,
     settings: Settings,
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[Ints, Ints]:
     """Return the columns of a region, and those that it explains."""
     kinds, low, high = (scores[name].values for name in ("what", "tau_min_s", "tau_max_s"))
     above = np.nan_to_num(combined) > settings.clear_sigma

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Complexes, Floats, Ints
 from gyrostab.diagnose.baseline.expected_statistics import (
     line_columns,
     sum_noise,
@@ -37,8 +37,6 @@ from gyrostab.kernels.random.stochastic import (
 from gyrostab.kernels.spectra.periodogram import band_covariance, taper
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 #: Null records up to this size stay in memory; larger ones are drawn again on each pass.
 MAX_KEPT_NULL_BYTES = 3e8
 #: Band powers of the null records that are drawn and scored together; bounds the memory.
@@ -56,13 +54,13 @@ _MIN_EIGENVALUE = 1e-9  # of a coherence: with gaps it may be negative for nearl
 class _SharedNoise(NamedTuple):
     """Noise that axes have in common."""
 
-    root: Complex  # (block, band, axis, axis): square root of the coherency matrix
-    pairs: NDArray[np.int64]  # (pair, 2): indices of the axes of each pair
-    axis_shape: Array  # (axis, block, band): shape of the gamma distribution of each power
-    pair_shape: Array  # (pair, block, band): the same for samples that both axes of a pair have
+    root: Complexes  # (block, band, axis, axis): square root of the coherency matrix
+    pairs: Ints  # (pair, 2): indices of the axes of each pair
+    axis_shape: Floats  # (axis, block, band): shape of the gamma distribution of each power
+    pair_shape: Floats  # (pair, block, band): the same for samples that both axes of a pair have
     #: (block, axis, axis): square root of the correlation matrix of the white noise of the block
     #: means.
-    white: Array
+    white: Floats
 
 
 class _NullSetup(NamedTuple):
@@ -71,12 +69,12 @@ class _NullSetup(NamedTuple):
     blocks: xr.Dataset
     baseline: xr.Dataset
     # Shapes of the gamma parts that each band has in common with the first, second, ... above it.
-    ties: list[Array]
-    effects: Array  # expected power over that of the noise alone
-    sd: Array  # standard deviations of a sample and of a difference of neighbours, by axis
+    ties: list[Floats]
+    effects: Floats  # expected power over that of the noise alone
+    sd: Floats  # standard deviations of a sample and of a difference of neighbours, by axis
     # Excess kurtosis of a block beyond that of white Gaussian noise, and its scatter over that of
     # white Gaussian noise, by axis.
-    tails: Array
+    tails: Floats
     shared: _SharedNoise | None  # noise common to axes
 
 
@@ -151,7 +149,7 @@ def _prepare_nulls(
     return _NullSetup(blocks, baseline, ties, effects, np.array(sd), tails, shared)
 
 
-def _common_shapes(shape: Array, size: int) -> list[Array]:
+def _common_shapes(shape: Floats, size: int) -> list[Floats]:
     """Return the shapes (axis, block, band) of the gamma parts common to neighbouring bands.
 
     The taper causes them. Negligible ones, of high bands and those far above, are left out.
@@ -179,14 +177,16 @@ def _common_shapes(shape: Array, size: int) -> list[Array]:
     return [tie * np.minimum(low, high) for low, high, tie in _pairs_of_bands(factor, ties)]
 
 
-def _pairs_of_bands(values: Array, ties: Sequence[Array]) -> Iterator[tuple[Array, Array, Array]]:
+def _pairs_of_bands(
+    values: Floats, ties: Sequence[Floats]
+) -> Iterator[tuple[Floats, Floats, Floats]]:
     """Yield the lower and the upper band of each tie as array slices, with the tie."""
     for apart, tie in enumerate(ties, start=1):
         yield values[..., : tie.shape[-1]], values[..., apart : apart + tie.shape[-1]], tie
 
 
 def _kurtosis_excess(
-    blocks: xr.Dataset, density: Array, rng: np.random.Generator
+    blocks: xr.Dataset, density: Floats, rng: np.random.Generator
 ) -> tuple[float, float]:
     """Simulate the kurtosis of full blocks of noise (line, term); return mean and scatter excess.
 
@@ -217,7 +217,7 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
     if "form_shape" in baseline:  # the form of the spectrum was measured on a simulated log
         form = baseline["form_shape"].values
         expected *= _draw_gamma(form, np.ones((count, *form.shape)), rng)[:, :, None]
-    between: Complex | None = None
+    between: Complexes | None = None
     if setup.shared is None:
         power = _draw_gamma(baseline["shape_alone"].values, expected, rng, setup.ties)
     else:
@@ -262,8 +262,8 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
 
 
 def _draw_gamma(
-    shape: Array, mean: Array, rng: np.random.Generator, ties: Sequence[Array] = ()
-) -> Array:
+    shape: Floats, mean: Floats, rng: np.random.Generator, ties: Sequence[Floats] = ()
+) -> Floats:
     """Draw gamma variables with these shapes and means; parts in `ties` are common to two bands.
 
     Shapes of variables of equal scale add up.
@@ -281,7 +281,9 @@ def _draw_gamma(
     return np.asarray(np.where(np.isinf(shape), 1.0, drawn / safe) * mean)
 
 
-def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.Generator) -> Array:
+def _draw_means(
+    setup: _NullSetup, squares: Floats, slow: Floats, rng: np.random.Generator
+) -> Floats:
     """Draw block means: white noise, random walk, flicker and the expected random processes."""
     blocks, baseline = setup.blocks, setup.baseline
     n, step = blocks.sizes["block"], float(blocks.attrs["block_s"])
@@ -326,7 +328,7 @@ def _draw_means(setup: _NullSetup, squares: Array, slow: Array, rng: np.random.G
     return np.asarray(total)
 
 
-def _draw_lines(setup: _NullSetup, squares: Array, rng: np.random.Generator) -> Array:
+def _draw_lines(setup: _NullSetup, squares: Floats, rng: np.random.Generator) -> Floats:
     """Draw the mean periodograms of the parts of the record."""
     blocks, baseline = setup.blocks, setup.baseline
     weight = blocks["line_weight"].values
@@ -359,7 +361,7 @@ def _draw_lines(setup: _NullSetup, squares: Array, rng: np.random.Generator) -> 
     return out
 
 
-def _correlate_lines(drawn: Array, size: int) -> Array:
+def _correlate_lines(drawn: Floats, size: int) -> Floats:
     """Correlate lines (..., line) of mean 1 as the taper does, by the squared taper's spectrum."""
     lines = drawn.shape[-1]
     correlation = np.abs(np.fft.fft(taper(size) ** 2)) ** 2
@@ -371,10 +373,10 @@ def _correlate_lines(drawn: Array, size: int) -> Array:
 
 def _draw_cross(
     setup: _NullSetup,
-    level: Array,
-    between: Complex | None,
+    level: Floats,
+    between: Complexes | None,
     rng: np.random.Generator,
-) -> Complex:
+) -> Complexes:
     """Return cross-spectra from those over the levels of both axes; independent ones if None."""
     first, second = pair_indices(setup.blocks)
     size = np.sqrt(level[:, first] * level[:, second])
@@ -383,7 +385,7 @@ def _draw_cross(
     return np.asarray(size * between)
 
 
-def _widen_tails(score: Array, n: Array) -> Array:
+def _widen_tails(score: Floats, n: Floats) -> Floats:
     """Add the tails that the kurtosis of n samples has beyond the law of Anscombe and Glynn.
 
     From half a million simulated blocks each of 100 to 2000 samples: once in a thousand blocks of
@@ -396,7 +398,7 @@ def _widen_tails(score: Array, n: Array) -> Array:
     )
 
 
-def _draw_kurtosis(setup: _NullSetup, count: int, rng: np.random.Generator) -> Array:
+def _draw_kurtosis(setup: _NullSetup, count: int, rng: np.random.Generator) -> Floats:
     """Draw the excess kurtosis of the noise; with few levels, that of other blocks."""
     blocks = setup.blocks
     recorded = blocks["kurtosis"].values
@@ -436,7 +438,7 @@ def _find_shared_noise(blocks: xr.Dataset, baseline: xr.Dataset) -> _SharedNoise
     )
 
 
-def _correlation_root(matrix: NDArray[Any]) -> NDArray[Any]:
+def _correlation_root(matrix: Array) -> Array:
     """Return square roots of correlation matrices (..., axis, axis)."""
     values, vectors = np.linalg.eigh(matrix)
     root = (
@@ -447,7 +449,7 @@ def _correlation_root(matrix: NDArray[Any]) -> NDArray[Any]:
 
 def _draw_shared_spectra(
     shared: _SharedNoise, count: int, rng: np.random.Generator
-) -> tuple[Array, Complex]:
+) -> tuple[Floats, Complexes]:
     """Draw powers over their expectation, and cross-spectra over the root of both expectations.
 
     The shapes are (record, axis or pair, block, band). They are Wishart distributed, drawn by the
@@ -474,7 +476,7 @@ def _draw_shared_spectra(
     return power, cross
 
 
-def _bartlett_factor(axis_shape: Array, rng: np.random.Generator) -> Complex:
+def _bartlett_factor(axis_shape: Floats, rng: np.random.Generator) -> Complexes:
     """Return Bartlett's triangular factor (axis, axis, block, band), over the root of the shape."""
     out = np.zeros((len(axis_shape), *axis_shape.shape), np.complex128)
     for row, shape in enumerate(axis_shape):
@@ -485,7 +487,7 @@ def _bartlett_factor(axis_shape: Array, rng: np.random.Generator) -> Complex:
     return out
 
 
-def _unpaired_scatter(pair_shape: Array, first_shape: Array, second_shape: Array) -> Array:
+def _unpaired_scatter(pair_shape: Floats, first_shape: Floats, second_shape: Floats) -> Floats:
     """Return the scatter of a cross-spectrum from samples without a partner (real, imaginary)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         excess = 1.0 / pair_shape - 1.0 / np.minimum(first_shape, second_shape)

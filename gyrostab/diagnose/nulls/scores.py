@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS
 
-Array = NDArray[np.float64]
 _KEPT_BELOW_SIGMA = 1.4  # below the largest of independent cells, from which scores are kept
 #: Powers of null records, in bands or at lines, that are scored at once; limits memory.
 _POWERS_AT_ONCE = 1_000_000
@@ -27,12 +26,12 @@ _MIN_SCORE_P_VALUE = 1e-9  # a tail from hundreds of records is unreliable beyon
 class MaximumDistribution:
     """Distribution of the largest value of a record: sample, and exponential tail above 3/4."""
 
-    sample: Array
+    sample: Floats
     start: float
     scale: float
     share: float
 
-    def surprise(self, value: Array | float) -> Array:
+    def surprise(self, value: Floats | float) -> Floats:
         """Return ``-log`` of the probability that a null record's largest is at least `value`."""
         value = np.asarray(value, dtype=float)
         rank = (self.sample.size - np.searchsorted(self.sample, value) + 1.0) / (
@@ -43,7 +42,7 @@ class MaximumDistribution:
             np.where(value > self.start, beyond, -np.log(np.clip(rank, self.share, 1.0)))
         )
 
-    def probability(self, value: Array | float) -> Array:
+    def probability(self, value: Floats | float) -> Floats:
         """Return the probability that a null record's largest is at least `value`."""
         return np.asarray(np.clip(np.exp(-self.surprise(value)), MIN_P_VALUE, 1.0))
 
@@ -58,8 +57,8 @@ class MaximumDistribution:
 class StatisticNull:
     """One statistic in null records: moments of cells, tail of half the squared largest score."""
 
-    mean: Array
-    spread: Array
+    mean: Floats
+    spread: Floats
     tail: MaximumDistribution
 
 
@@ -73,7 +72,7 @@ class NullScores:
     family: MaximumDistribution
     settings: Settings = DEFAULTS
 
-    def p_value(self, statistic: str, z: Array | float) -> Array:
+    def p_value(self, statistic: str, z: Floats | float) -> Floats:
         """Return the probability that a null record is as extreme in any statistic as `z` here."""
         surprise = self.statistics[statistic].tail.surprise(np.square(z) / 2.0)
         return np.asarray(np.maximum(self.family.probability(surprise), _MIN_SCORE_P_VALUE))
@@ -115,13 +114,13 @@ def null_scores(
     return NullScores(statistics, family, settings)
 
 
-def standardise(scores: xr.Dataset, null: StatisticNull) -> Array:
+def standardise(scores: xr.Dataset, null: StatisticNull) -> Floats:
     """Return scores in standard deviations of the null records, at least 0 if one-sided."""
     z = (scores["z"].values - null.mean) / null.spread
     return np.asarray(np.maximum(z, 0.0) if scores.attrs["one_sided"] else z)
 
 
-def fit_best_evidence(best: Array, *, settings: Settings = DEFAULTS) -> MaximumDistribution:
+def fit_best_evidence(best: Floats, *, settings: Settings = DEFAULTS) -> MaximumDistribution:
     """Fit the distribution of the best evidence of a null record [nats].
 
     Examples
@@ -133,7 +132,7 @@ def fit_best_evidence(best: Array, *, settings: Settings = DEFAULTS) -> MaximumD
     return _fit_maximum(best, settings.tail_share, _MIN_EVIDENCE_SCALE)
 
 
-def _fit_maximum(largest: Array, tail_share: float, min_scale: float) -> MaximumDistribution:
+def _fit_maximum(largest: Floats, tail_share: float, min_scale: float) -> MaximumDistribution:
     """Fit the distribution of the largest values, with a tail of at least this scale."""
     sample = np.sort(largest)
     start = float(np.quantile(sample, 1.0 - tail_share))
@@ -151,7 +150,7 @@ class _ScoreSums:
         self.pooled_records = pooled_records
         self.shape = scores["z"].shape[1:]
         self.sums = np.zeros((3, int(np.prod(self.shape))))
-        self.extremes: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
+        self.extremes: list[tuple[Ints, Ints, Floats]] = []
         self.records = 0
         self.one_sided = bool(scores.attrs["one_sided"])
         self.floor = np.broadcast_to(scores["floor"].values, self.shape).ravel()
@@ -179,7 +178,7 @@ class _ScoreSums:
         self.extremes.append((record + self.records, cell, z[record, cell]))
         self.records += len(z)
 
-    def _pool_variance(self) -> Array:
+    def _pool_variance(self) -> Floats:
         """Return the variance of each cell, averaged over windows of equal length."""
         count, first, second = (part.reshape(self.shape) for part in self.sums)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -194,7 +193,7 @@ class _ScoreSums:
             )
         return pooled_variance.ravel()
 
-    def finish(self) -> tuple[Array, Array, Array]:
+    def finish(self) -> tuple[Floats, Floats, Floats]:
         """Return mean and spread of every cell, and the largest scores by the other records."""
         pooled_variance = self._pool_variance()
         mean, spread = self._pooled_moments(self.sums, pooled_variance, self.floor)
@@ -211,8 +210,8 @@ class _ScoreSums:
         return mean.reshape(self.shape), spread.reshape(self.shape), largest
 
     def _pooled_moments(
-        self, sums: Array, pooled_variance: Array, floor: Array
-    ) -> tuple[Array, Array]:
+        self, sums: Floats, pooled_variance: Floats, floor: Floats
+    ) -> tuple[Floats, Floats]:
         """Return mean and standard deviation from running sums, with shrunk variance."""
         count, first, second = sums
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
@@ -24,7 +24,6 @@ from gyrostab.noise import NORMAL_95
 from gyrostab.physics.registry import effects
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
 MAX_ZERO_LAG_S = 1e-2  # a lag that counts as zero
 #: Probability beyond the values that a grid supports. Design choice: a tenth of the tail of a 95 %
 #: interval, so that the interval of a single normal law stays as it is.
@@ -44,7 +43,7 @@ MAX_RATIO = 100.0  # of two neighbours, above which the smaller one counts as ze
 
 def average_sizes(
     component: Component, state: State, candidates: Sequence[Candidate]
-) -> tuple[Array, Array, Array, dict[str, tuple[float, ...]], tuple[Array, Variant]]:
+) -> tuple[Floats, Floats, Floats, dict[str, tuple[float, ...]], tuple[Floats, Variant]]:
     """Return the sizes of a component, averaged over the noise and the nuisance parameters.
 
     Exponents have their defaults and lags are zero unless other values are better by 3 nats and an
@@ -136,7 +135,7 @@ def choose_grid(component: Component, state: State, candidates: Sequence[Candida
     return plain if is_plain else grid
 
 
-def _size_interval(mean: Array, covariance: Array, supported: Sequence[Mixture]) -> Array:
+def _size_interval(mean: Floats, covariance: Floats, supported: Sequence[Mixture]) -> Floats:
     """Return the ends of the 95 % intervals, (2, column), within what any of the mixtures allows.
 
     Examples
@@ -216,7 +215,7 @@ def _is_lag(name: str) -> bool:
     return name == "lag" or name.endswith("_lag")
 
 
-def _interval_ends(tried: Array, share: Array, middle: float) -> tuple[float, float]:
+def _interval_ends(tried: Floats, share: Floats, middle: float) -> tuple[float, float]:
     """Return the ends of the 95 % interval of a nuisance parameter on a grid.
 
     Each value represents all that are nearer to it than to its neighbours, and as much beyond the
@@ -236,7 +235,7 @@ def _interval_ends(tried: Array, share: Array, middle: float) -> tuple[float, fl
     return min(float(low), middle), max(float(high), middle)
 
 
-def _grid_spacing(grid: Array, place: float) -> float:
+def _grid_spacing(grid: Floats, place: float) -> float:
     """Return the distance of the grid's values about a place."""
     values = np.unique(grid)
     nearest = int(np.abs(values - place).argmin())

@@ -13,14 +13,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Ints
 from gyrostab.physics.prediction import Prediction
 
 if TYPE_CHECKING:
     from gyrostab.diagnose.statistics.base import Statistic
-
-Array = NDArray[Any]
 
 
 def content_digest(*items: Array | bytes | None) -> bytes:
@@ -163,7 +161,7 @@ class CandidateEvidence:
     evidence_nats: Array  # (record, row): held-out evidence [nats]
     best: tuple[Variant, ...]  # best variant of each row for the first record
     #: (record, row): index of the line for lines; otherwise empty.
-    place: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 0), np.int64))
+    place: Ints = field(default_factory=lambda: np.empty((0, 0), np.int64))
     #: (variant, row): log Bayes factors on the first record with their prior, or empty [nats].
     variant_nats: Array = field(default_factory=lambda: np.empty((0, 0)))
 

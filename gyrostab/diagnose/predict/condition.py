@@ -8,8 +8,8 @@ from functools import partial
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.diagnose.evidence.held_out import noise_columns
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State, pair_rows, select_row
@@ -17,7 +17,6 @@ from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.regression.nonnegative import solve_bounded
 
-Array = NDArray[np.float64]
 #: Least fitted power over the expected one. Design choice.
 MIN_POWER_RATIO = 0.2
 
@@ -34,12 +33,12 @@ def condition_on_components(state: State, components: Iterable[Component]) -> St
     return state
 
 
-def mean_columns(variant: Variant, row: int) -> list[Array]:
+def mean_columns(variant: Variant, row: int) -> list[Floats]:
     """Return the columns of the mean on an axis, (block,) each."""
     return [select_row(design, row) for design in variant.design]
 
 
-def free_covariance(state: State, axes: tuple[str, ...], density: Array) -> State:
+def free_covariance(state: State, axes: tuple[str, ...], density: Floats) -> State:
     """Add any covariance of these axes with the others of this density, (block, band)."""
     nothing = np.zeros_like(density)
     for pair in pair_rows(state.blocks):
@@ -52,7 +51,7 @@ def free_covariance(state: State, axes: tuple[str, ...], density: Array) -> Stat
     return state
 
 
-def find_bands(blocks: xr.Dataset, frequency: float) -> NDArray[np.int64]:
+def find_bands(blocks: xr.Dataset, frequency: float) -> Ints:
     """Return the indices of the bands within the resolution of a block of a frequency."""
     reach = 1.0 / float(blocks.attrs["block_s"])
     low, high = blocks["band_low"].values - reach, blocks["band_high"].values + reach
@@ -78,7 +77,7 @@ def refit_weights(state: State) -> State:
     )
 
 
-def fit_powers(state: State, axis: str, left_out: NDArray[np.bool_] | None = None) -> Array:
+def fit_powers(state: State, axis: str, left_out: Bools | None = None) -> Floats:
     """Fit the powers of an axis, (block, band), and leave some of its power columns out of them."""
     row, shape = state.axes.index(axis), state.weight.shape[1:]
     expected = axis_values(state.baseline, "spectrum", axis)
@@ -99,7 +98,7 @@ def fit_powers(state: State, axis: str, left_out: NDArray[np.bool_] | None = Non
 
 
 def drop_changed_tails(
-    blocks: xr.Dataset, expected: Array, settings: Settings = DEFAULTS
+    blocks: xr.Dataset, expected: Floats, settings: Settings = DEFAULTS
 ) -> xr.Dataset:
     """Drop kurtosis and outliers that a changing noise level explains.
 
@@ -114,7 +113,7 @@ def drop_changed_tails(
         np.abs(level - np.median(level, axis=1, keepdims=True)) > settings.max_level_step
     )
     out = blocks.copy()
-    left_out: dict[str, tuple[NDArray[np.bool_], float]]
+    left_out: dict[str, tuple[Bools, float]]
     left_out = {"kurtosis": (unusual, np.nan), "outliers": (turns, 0)}
     for name, (where, replacement) in left_out.items():
         out[name].values = np.where(where, replacement, out[name].values)
@@ -125,13 +124,13 @@ _ROUNDS = 4  # steps of Fisher scoring
 
 
 def _fit_sizes(
-    expected: Array,
-    columns: Array,
-    prior: Array,
-    low: Array,
-    power: Array,
-    shape: Array,
-) -> Array:
+    expected: Floats,
+    columns: Floats,
+    prior: Floats,
+    low: Floats,
+    power: Floats,
+    shape: Floats,
+) -> Floats:
     """Fit the sizes of columns (block, band, column) to powers with gamma distributions.
 
     The sizes are at least `low`.

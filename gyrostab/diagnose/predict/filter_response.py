@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.predict.windows import (
     FREQUENCIES_PER_BAND,
     frequencies_in_bands,
@@ -22,14 +22,13 @@ from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction
 from gyrostab.physics.registry import effects
 
-Array = NDArray[np.float64]
 _SIZE_COUNT = 50  # filter sizes that are tried; limits resolution
 _MIN_PASSED_SHARE = 0.002  # smallest passed share that is tried, besides 0
 _MAX_LINE_RATIO = 3.0  # of the local level; higher lines are cut
 _MIN_RESPONSE = 0.05  # of the largest; below, the power is leakage from other frequencies
 
 
-def _estimate_size(power: Array, full: Array) -> float:
+def _estimate_size(power: Floats, full: Floats) -> float:
     """Estimate the filter size by the likelihood of powers over those without it, at any level."""
     # Lines do not belong to the shape of the spectrum.
     usual = np.minimum(power, _MAX_LINE_RATIO * local_level(power[None])[0])
@@ -41,7 +40,7 @@ def _estimate_size(power: Array, full: Array) -> float:
     )
 
 
-def band_response(effect: Effect, blocks: xr.Dataset) -> Array:
+def band_response(effect: Effect, blocks: xr.Dataset) -> Floats:
     """Return the factor (band, term) on the power of the noise terms Q, N, B and K in each band.
 
     It is averaged over the power of the term at the frequencies of the band.
@@ -63,7 +62,7 @@ def with_band_response(prediction: Prediction, effect: Effect, blocks: xr.Datase
     return replace(prediction, response=dict(zip(prediction.response, factors, strict=True)))
 
 
-def band_shape_factor(effect: Effect, blocks: xr.Dataset) -> Array:
+def band_shape_factor(effect: Effect, blocks: xr.Dataset) -> Floats:
     """Return the factor on the gamma shape of white noise in each band.
 
     Lines of unequal power have fewer degrees of freedom together than equal ones.
@@ -72,19 +71,19 @@ def band_shape_factor(effect: Effect, blocks: xr.Dataset) -> Array:
     return np.asarray(response.mean(axis=1) ** 2 / (response**2).mean(axis=1))
 
 
-def _split_into_bands(values: Array) -> Array:
+def _split_into_bands(values: Floats) -> Floats:
     """Return values at `frequencies_in_bands` as (band, frequency)."""
     return values.reshape(-1, FREQUENCIES_PER_BAND)
 
 
-def filter_factors(effect: Effect, blocks: xr.Dataset, frequency: Array) -> Mapping[str, Array]:
+def filter_factors(effect: Effect, blocks: xr.Dataset, frequency: Floats) -> Mapping[str, Floats]:
     """Return the factors of a filter at frequencies, by noise term."""
     return effect.explain(replace(make_windows(blocks, {}), frequency=frequency)).response
 
 
 def undo_filter(
-    blocks: xr.Dataset, axis: str, effect: str, values: Mapping[str, Any], expected: Array
-) -> tuple[xr.Dataset, NDArray[np.bool_]]:
+    blocks: xr.Dataset, axis: str, effect: str, values: Mapping[str, Any], expected: Floats
+) -> tuple[xr.Dataset, Bools]:
     """Undo a filter in the line spectrum of an axis, once only; return the lines that it stops.
 
     A filter is named by the shape of its response, at any size: a weak one is undone by as much as

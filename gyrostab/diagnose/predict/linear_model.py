@@ -12,8 +12,8 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Bools
 from gyrostab.diagnose.evidence.held_out import LinearModel
 from gyrostab.diagnose.predict.candidates import Candidate, content_digest
 from gyrostab.diagnose.reduce.block_statistics import measured, pair_indices
@@ -22,7 +22,6 @@ from gyrostab.kernels.spectra.expected import correlated_powers
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
 from gyrostab.physics.prediction import Prediction
 
-Array = NDArray[Any]
 Result = TypeVar("Result")
 
 
@@ -35,7 +34,7 @@ class State:
     #: (axis, block, band): powers that define the weights of all cells [degree2 hour-2 Hz-1]:
     #: expected, plus those of the named effects.
     weight: Array
-    masked: NDArray[np.bool_]  # (axis, block): blocks whose powers and cross-spectra are left out
+    masked: Bools  # (axis, block): blocks whose powers and cross-spectra are left out
     #: (statistic, row) -> columns in the model with and without a candidate; the row is an axis, or
     #: the two axes of a pair with a comma between them. Powers that effects add, whose sizes cannot
     #: be negative, are under "added_power", all others under "power".
@@ -160,7 +159,7 @@ def pair_rows(blocks: xr.Dataset) -> list[tuple[str, ...]]:
 
 def moves_within_blocks(
     mean: Array, density: Array, blocks: xr.Dataset, settings: Settings
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Find the blocks in which a mean (..., block) moves far above noise of this density.
 
     None where most blocks move. A step of D in the middle of a block of T seconds adds the power
@@ -174,7 +173,7 @@ def moves_within_blocks(
     return np.asarray(moving & is_rare)
 
 
-def cross_without(blocks: xr.Dataset, left_out: NDArray[np.bool_]) -> xr.DataArray:
+def cross_without(blocks: xr.Dataset, left_out: Bools) -> xr.DataArray:
     """Return cross-spectra of the pairs without blocks that are left out (axis, block)."""
     first, second = pair_indices(blocks)
     without = xr.DataArray(left_out[first] | left_out[second], dims=("pair", "block"))

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.diagnose.evidence.products import held_out_evidence
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence
 from gyrostab.diagnose.predict.linear_model import Result, State
 
-Array = NDArray[np.float64]
 _COLUMNS_AT_ONCE = 300  # limits memory and time, which grow with the square
 _MIN_ROW_NATS = 1.5  # that another axis or statistic must add; design choice
 
@@ -38,7 +37,7 @@ class Trial(NamedTuple):
         self,
         compute: Callable[[], Result],
         group: Sequence[Candidate],
-        *inputs: NDArray[Any] | None,
+        *inputs: Array | None,
     ) -> Result:
         """Compute something for candidates; on the recording, recall it if nothing has changed."""
         if self.is_null:
@@ -81,9 +80,9 @@ def _split_group(group: Sequence[Candidate]) -> Iterator[list[Candidate]]:
         yield [candidate for candidate, own in zip(group, part, strict=True) if own == number]
 
 
-def evidence_by_effect(all_evidence: Sequence[CandidateEvidence]) -> dict[str, Array]:
+def evidence_by_effect(all_evidence: Sequence[CandidateEvidence]) -> dict[str, Floats]:
     """Sum up the evidence (record,) of every effect by the key of its candidates."""
-    rows: dict[str, list[Array]] = {}
+    rows: dict[str, list[Floats]] = {}
     for evidence in all_evidence:
         rows.setdefault(evidence.candidate.key, []).append(evidence.evidence_nats)
     return {
@@ -92,14 +91,14 @@ def evidence_by_effect(all_evidence: Sequence[CandidateEvidence]) -> dict[str, A
     }
 
 
-def combine_rows(evidence_nats: Array) -> Array:
+def combine_rows(evidence_nats: Floats) -> Floats:
     """Add up the evidence of an effect over its rows (..., row), minus the price of naming more."""
     good = np.sort(np.nan_to_num(evidence_nats, neginf=-1e9), axis=-1)
     return np.asarray(good[..., -1] + np.maximum(good[..., :-1] - _MIN_ROW_NATS, 0.0).sum(axis=-1))
 
 
 def collect_evidence(
-    group: Sequence[Candidate], rows: list[tuple[str, ...]], factors: list[Array], spread: int = 1
+    group: Sequence[Candidate], rows: list[tuple[str, ...]], factors: list[Floats], spread: int = 1
 ) -> list[CandidateEvidence]:
     """Compute the held-out evidence of a group from the factors of all variants, by row."""
     variants = [
@@ -128,9 +127,7 @@ def collect_evidence(
     return out
 
 
-def _share_variants(
-    factors: Sequence[Array], owner: NDArray[np.int64], weight: Array
-) -> list[Array]:
+def _share_variants(factors: Sequence[Floats], owner: Ints, weight: Floats) -> list[Floats]:
     """Return the probability of each variant for each row before its data, (design, record).
 
     Axes usually share an instant, a lag or a time constant. The row with the largest factor has the

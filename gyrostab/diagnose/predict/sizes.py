@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.held_out import mean_residual, noise_weight
 from gyrostab.diagnose.evidence.mixture import Mixture, products_mixture
 from gyrostab.diagnose.evidence.products import axis_noise, mean_products
@@ -15,16 +15,15 @@ from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.kernels.regression.nonnegative import solve_bounded
 
-Array = NDArray[np.float64]
 _RIDGE = 1e-12  # of the trace of the Gram matrix, against singular columns
 
 
 def mean_mixture(
     state: State,
     axis: str,
-    columns: Sequence[Array],
+    columns: Sequence[Floats],
     *,
-    variance: Array | None = None,
+    variance: Floats | None = None,
 ) -> Mixture:
     """Compute the sizes of columns of the block means of an axis, over the grid of K and B.
 
@@ -108,7 +107,9 @@ def linear_mixture(component: Component, state: State, variant: Variant) -> Mixt
     return Mixture(np.array([log_weight]), (mean / scale)[None], own_covariance[None])
 
 
-def _own_sizes(normal: Array, projected: Array, low: Array, own_count: int) -> tuple[Array, Array]:
+def _own_sizes(
+    normal: Floats, projected: Floats, low: Floats, own_count: int
+) -> tuple[Floats, Floats]:
     """Return the first sizes and their covariance, from the normal equations of all.
 
     Each of them may be any number, so that its error tells how far from its bound it is, while all
@@ -126,7 +127,7 @@ def _own_sizes(normal: Array, projected: Array, low: Array, own_count: int) -> t
     return mean, 0.5 * (covariance + covariance.T)
 
 
-def disagreement_nats(size: Array, weight: Array) -> float:
+def disagreement_nats(size: Floats, weight: Floats) -> float:
     """Return half the chi-square of sizes of these weights about their mean."""
     mean = (weight * size).sum() / max(weight.sum(), 1e-300)
     return 0.5 * float((weight * (size - mean) ** 2).sum())

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Complexes, Ints
 from gyrostab.diagnose.predict.candidates import (
     TIME_PARAMETER,
     Candidate,
@@ -23,7 +23,6 @@ from gyrostab.physics.base import Effect, driver_error
 from gyrostab.physics.prediction import Prediction, Windows
 from gyrostab.physics.registry import effects
 
-Array = NDArray[Any]
 FREQUENCIES_PER_BAND = 48  # to average a response or a narrow peak; design choice
 _SPLINE_KNOTS = 12  # of hat functions over the record; design choice
 _MAX_DESIGN_DIFFERENCE = 1e-3  # of its size, up to which designs are equal; design choice
@@ -163,7 +162,7 @@ def predict_effect(
     )
 
 
-def complex_factors(effect: Effect, name: str, axes: tuple[str, ...]) -> NDArray[np.complex128]:
+def complex_factors(effect: Effect, name: str, axes: tuple[str, ...]) -> Complexes:
     """Return the complex factor of a spectrum for each axis: size, direction, phase."""
     parameters = {parameter.name: parameter for parameter in effect.parameters()}
     factor = effect.expand_to_axes(name, axes).astype(np.complex128)
@@ -317,7 +316,7 @@ def make_surrogates(
     component: Component,
     blocks: xr.Dataset,
     coefficient: xr.DataArray,
-    shifts: NDArray[np.int64],
+    shifts: Ints,
 ) -> list[Variant | None]:
     """Return the variant for channels that are rotated in time by each shift, end to start."""
     candidate = component.candidate
@@ -327,7 +326,7 @@ def make_surrogates(
     means = measured(blocks, "mean").values
 
     def shift_windows(shift: int) -> Windows:
-        def rotate(values: NDArray[Any]) -> NDArray[Any]:
+        def rotate(values: Array) -> Array:
             return np.roll(values, shift, axis=0)
 
         shifted = replace(
@@ -352,7 +351,7 @@ def make_surrogates(
 def max_correlation(surrogate: Variant, true: Variant, row: int) -> float:
     """Return the largest correlation of the columns over time, of either sign."""
 
-    def flat(design: NDArray[Any]) -> NDArray[Any]:
+    def flat(design: Array) -> Array:
         rows = design[:, row if design.shape[1] > 1 else 0]
         rows = rows.reshape(rows.shape[0], rows.shape[1], -1).mean(axis=-1)
         return np.asarray(rows - rows.mean(axis=1, keepdims=True))

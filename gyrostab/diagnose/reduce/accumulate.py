@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from functools import partial
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Bools, Complexes, Floats, Ints
 from gyrostab.diagnose.reduce.log_blocks import BlockBatch, finite_range, numeric_channels
 from gyrostab.diagnose.reduce.outliers import (
     Peaks,
@@ -24,7 +24,6 @@ from gyrostab.kernels.spectra import periodogram as kernel
 from gyrostab.kernels.spectra.outliers import HISTOGRAM
 from gyrostab.time.grid import first_stamp
 
-Array = NDArray[np.float64]
 #: Parts of the record, each with its own line spectrum. Design choice: eight show whether a line
 #: persists or drifts.
 RECORD_PARTS = 8
@@ -47,9 +46,9 @@ _GRID_SAMPLES_PER_AXIS = 2**16  # limits memory
 class _Masks(NamedTuple):
     """What the gaps of blocks do to their powers."""
 
-    expected: Array  # (block, line): expected power of white noise
-    shape: Array  # (block, band): shapes of the gamma distributions of the powers
-    neighbours: Array  # (block,): tapered share of neighbouring pairs of samples
+    expected: Floats  # (block, line): expected power of white noise
+    shape: Floats  # (block, band): shapes of the gamma distributions of the powers
+    neighbours: Floats  # (block,): tapered share of neighbouring pairs of samples
 
 
 class Accumulator:
@@ -73,8 +72,8 @@ class Accumulator:
         full = self._read_masks(np.ones((1, length), bool))
         self.full = _Masks(full.expected, full.shape[0], full.neighbours[0])
         self.lagged = [name for name in self.channels if name.startswith(LAGGED_CHANNEL_PREFIXES)]
-        self.batches: list[dict[str, NDArray[Any]]] = []
-        self.at_once: dict[tuple[bool, ...], NDArray[np.int64]] = {
+        self.batches: list[dict[str, Array]] = []
+        self.at_once: dict[tuple[bool, ...], Ints] = {
             (True,) * self.axes: np.zeros(block_count, np.int64)
         }
         self.peaks: list[list[Peaks]] = [[] for _ in range(self.axes)]
@@ -82,7 +81,7 @@ class Accumulator:
         self.line_expected = np.zeros_like(self.line_sum)
         self.line_counts = np.zeros((self.axes, RECORD_PARTS, 2))
         self.sines = SineSearch(self.axes, block_count, length, rate)
-        self.kept_samples: list[Array] = []
+        self.kept_samples: list[Floats] = []
         self.gap_ends: list[int] = []  # samples from which on samples are lost, or there again
         self.is_lost = False
         self.rotation = make_rotation_orders(log, length, rate)
@@ -93,7 +92,7 @@ class Accumulator:
         if self.ramp_range[0] >= self.ramp_range[1]:
             self.ramp = None
 
-    def collect(self) -> dict[str, NDArray[Any]]:
+    def collect(self) -> dict[str, Array]:
         """Return the statistics of all blocks, by name, as arrays (row, block, ...)."""
         return {
             name: np.concatenate([batch[name] for batch in self.batches], axis=1)
@@ -119,7 +118,7 @@ class Accumulator:
             bits = np.where(is_sent, values[row].view(np.int64), 0)
             kernel.resent_samples(bits, _MIN_RESENT, resent[row])
         sub_blocks = [_average_parts(axis_values, SUB_BLOCKS) for axis_values in values[:axes]]
-        by_name: dict[str, NDArray[Any]] = {
+        by_name: dict[str, Array] = {
             "moments": moments,
             "counts": counts,
             "resent": resent,
@@ -170,7 +169,7 @@ class Accumulator:
             }
         self.batches.append(by_name)
 
-    def _measure_ramp_turns(self, phase: Array) -> Array:
+    def _measure_ramp_turns(self, phase: Floats) -> Floats:
         """Measure the ramp's turns per second; a move between samples is below half a turn."""
         low, high = self.ramp_range
         moved = np.diff(phase, axis=1) / (high - low)
@@ -181,8 +180,8 @@ class Accumulator:
         return np.asarray(mean * self.rate)
 
     def _measure_spectra(
-        self, block_range: slice, centred: Array, present: NDArray[np.bool_]
-    ) -> dict[str, NDArray[Any]]:
+        self, block_range: slice, centred: Floats, present: Bools
+    ) -> dict[str, Array]:
         """Return band powers and cross-powers, and add line spectra.
 
         A channel counts where a gyro sample is present: gaps spread a slow wave of the channel over
@@ -238,7 +237,7 @@ class Accumulator:
             "cross_samples": cross_samples,
         }
 
-    def _measure_turn_spectra(self, turns: Array, present: NDArray[np.bool_]) -> Array:
+    def _measure_turn_spectra(self, turns: Floats, present: Bools) -> Floats:
         """Return band powers of waves at the harmonics of the rotation, and add line spectra.
 
         The waves have an amplitude of 1 and any phase, and are sampled where an axis is: an uneven
@@ -258,12 +257,12 @@ class Accumulator:
         power[:, ~used] = 0.0
         return power
 
-    def _transform_axes(self, centred: Array) -> NDArray[np.complex128]:
+    def _transform_axes(self, centred: Floats) -> Complexes:
         """Return the tapered spectra (..., line) of blocks (..., sample)."""
         spectra = np.fft.rfft(centred * self.weights, axis=-1)
         return np.asarray(spectra[..., 1 : kernel.ordinates(self.length) + 1])
 
-    def _read_masks(self, present: NDArray[np.bool_]) -> _Masks:
+    def _read_masks(self, present: Bools) -> _Masks:
         """Return what the gaps of blocks (block, sample) do to their powers."""
         expected, mask, squared = kernel.gap_spectra(present, self.weights)
         shape = kernel.shape_of_bands(
@@ -271,9 +270,7 @@ class Accumulator:
         )
         return _Masks(expected, shape, _neighbour_share(present, self.weights))
 
-    def _read_gaps(
-        self, present: NDArray[np.bool_], used: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.int64], Array, Array, Array]:
+    def _read_gaps(self, present: Bools, used: Bools) -> tuple[Ints, Floats, Floats, Floats]:
         """Return the mask of each block (0 is full), their expected powers, and shares by block."""
         gappy = used & ~present.all(axis=-1)
         place = np.zeros(used.size, np.int64)
@@ -290,10 +287,10 @@ class Accumulator:
         self,
         row: int,
         block_range: slice,
-        spectra: NDArray[np.complex128],
-        table: Array,
-        place: NDArray[np.int64],
-        used: NDArray[np.bool_],
+        spectra: Complexes,
+        table: Floats,
+        place: Ints,
+        used: Bools,
     ) -> None:
         """Add periodograms at full resolution to the parts of the record."""
         part_of = np.arange(block_range.start, block_range.stop) * RECORD_PARTS // self.block_count
@@ -308,8 +305,8 @@ class Accumulator:
             self.line_counts[row, part] += [middle.sum(), (middle**2).sum()]
 
     def _joint_spectra(
-        self, centred: Array, present: NDArray[np.bool_], power: Array
-    ) -> tuple[NDArray[np.complex128], Array]:
+        self, centred: Floats, present: Bools, power: Floats
+    ) -> tuple[Complexes, Floats]:
         """Return cross-powers and shapes of blocks over the samples of both signals.
 
         The coherency is that of the joint samples, `power` (2, block, band) that of each signal.
@@ -325,7 +322,7 @@ class Accumulator:
         scale = np.divide(power.prod(axis=0), joint, out=np.zeros_like(joint), where=joint > 0.0)
         return cross * np.sqrt(scale), shape
 
-    def _find_gaps(self, block_range: slice, present: NDArray[np.bool_]) -> None:
+    def _find_gaps(self, block_range: slice, present: Bools) -> None:
         """List the ends of the gaps, in which no axis has a sample."""
         lost = ~present.any(axis=0).ravel()
         changes = np.flatnonzero(np.diff(lost, prepend=self.is_lost))
@@ -333,7 +330,7 @@ class Accumulator:
         self.is_lost = bool(lost[-1])
 
 
-def _average_parts(values: Array, parts: int) -> tuple[Array, NDArray[np.int64]]:
+def _average_parts(values: Floats, parts: int) -> tuple[Floats, Ints]:
     """Return means and numbers of the samples in equal parts of the blocks (block, sample)."""
     edges, present = np.arange(parts) * values.shape[1] // parts, ~np.isnan(values)
     total = np.add.reduceat(np.where(present, values, 0.0), edges, axis=1)
@@ -342,14 +339,14 @@ def _average_parts(values: Array, parts: int) -> tuple[Array, NDArray[np.int64]]
         return total / number, number
 
 
-def _subtract_mean(values: Array, present: NDArray[np.bool_]) -> Array:
+def _subtract_mean(values: Floats, present: Bools) -> Floats:
     """Subtract the mean of the samples present from each block; 0 where none is present."""
     total = (values * present).sum(axis=-1, keepdims=True)
     mean = total / np.maximum(present.sum(axis=-1), 1)[..., None]
     return np.where(present, values - mean, 0.0)
 
 
-def _neighbour_share(present: NDArray[np.bool_], weights: Array) -> Array:
+def _neighbour_share(present: Bools, weights: Floats) -> Floats:
     """Return the tapered share of neighbouring pairs of samples."""
     tapered = present * weights
     with np.errstate(invalid="ignore"):

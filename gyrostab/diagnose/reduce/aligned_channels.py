@@ -10,14 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.schema import find_unusable_channels, log_channels, signal_name
 from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_index, grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
-Array = NDArray[np.float64]
-Stamps = NDArray[np.int64]
 #: Sampling periods of the gyro up to which a channel counts as sampled like the gyro: each sample
 #: then has a value within three quarters of a period. A slower ramp is not used, because its phase
 #: between its samples is unknown. Derived: half of 1.5 periods.
@@ -43,7 +42,7 @@ _MAX_STAMPS_INSPECTED = 2**20  # limits memory
 _CHUNK_SAMPLES = 2**20  # samples converted at once; limits memory
 
 #: Instants, stamps and their values, and reach [ns] -> value at each instant.
-_Choose = Callable[[Stamps, Stamps, Array, float], Array]
+_Choose = Callable[[Ints, Ints, Floats, float], Floats]
 
 
 class Aligned(NamedTuple):
@@ -61,15 +60,15 @@ class Clock:
     size: int
     start: int = 0
     rate: float = 0.0
-    stamps: Stamps | None = None
+    stamps: Ints | None = None
 
-    def stamps_between(self, low: int, high: int) -> Stamps:
+    def stamps_between(self, low: int, high: int) -> Ints:
         """Return the stamps of the values `low` to `high`."""
         if self.stamps is not None:
             return self.stamps[low:high]
         return grid_times(self.start, self.rate, np.arange(low, high))
 
-    def count_before(self, instants: ArrayLike) -> Stamps:
+    def count_before(self, instants: ArrayLike) -> Ints:
         """Count the values before each instant [ns since 1970]."""
         if self.stamps is not None:
             return np.asarray(np.searchsorted(self.stamps, instants))
@@ -226,7 +225,7 @@ def _place_on_grid(log: xr.Dataset, name: str, clock: Clock, reach: float, choos
     """
     start, rate, size = first_stamp(log), float(log.attrs["sampling_rate_hz"]), log.sizes["time"]
 
-    def place_values(values: Any, offset: int, low: int, high: int) -> Array:
+    def place_values(values: Any, offset: int, low: int, high: int) -> Floats:
         numbers = np.asarray(values, dtype=np.float64)
         stamps = clock.stamps_between(offset, offset + numbers.size)
         good = np.isfinite(numbers)
@@ -256,15 +255,15 @@ def _place_on_grid(log: xr.Dataset, name: str, clock: Clock, reach: float, choos
     )
 
 
-def _take_nearest(instants: Stamps, stamps: Stamps, values: Array, reach: float) -> Array:
+def _take_nearest(instants: Ints, stamps: Ints, values: Floats, reach: float) -> Floats:
     """Return the nearest value of each instant, NaN beyond reach."""
     place = np.searchsorted(stamps[1:] + stamps[:-1], 2 * instants)
     return np.where(np.abs(instants - stamps[place]) <= reach, values[place], np.nan)
 
 
 def interpolate_linearly(
-    instants: Stamps, stamps: Stamps, values: Array, reach: float, *, hold_previous: bool
-) -> Array:
+    instants: Ints, stamps: Ints, values: Floats, reach: float, *, hold_previous: bool
+) -> Floats:
     """Interpolate linearly, or hold the previous value; NaN across gaps longer than reach."""
     high = np.minimum(np.searchsorted(stamps, instants), stamps.size - 1)
     low = np.where(stamps[high] == instants, high, np.maximum(high - 1, 0))
@@ -276,8 +275,8 @@ def interpolate_linearly(
 
 
 def _average_around(
-    instants: Stamps, stamps: Stamps, values: Array, reach: float, *, period: float
-) -> Array:
+    instants: Ints, stamps: Ints, values: Floats, reach: float, *, period: float
+) -> Floats:
     """Return the mean of the values within half a period of the gyro of each instant."""
     edges = np.append(instants, instants[-1] + round(period)) - round(period / 2.0)
     place = np.searchsorted(edges, stamps, side="right") - 1

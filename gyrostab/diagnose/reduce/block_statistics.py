@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.fft import prev_fast_len
 
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.diagnose.reduce.accumulate import Accumulator
 from gyrostab.diagnose.reduce.label_statistics import label_statistics
 from gyrostab.diagnose.reduce.log_blocks import count_samples, read_batches
@@ -17,7 +17,6 @@ from gyrostab.progress import Stage, no_stage
 from gyrostab.schema import check_log
 from gyrostab.time.durations import duration_seconds, samples
 
-Array = NDArray[np.float64]
 _BLOCK_S = 20.0  # default block; design choice
 _MIN_DEFAULT_BLOCKS = 90  # shorter blocks in shorter records; design choice
 _MAX_BLOCKS = 1000  # longer blocks in records above 5.6 h; bounds memory and time
@@ -69,7 +68,7 @@ def reduce_log(
     *,
     block: Any = None,
     restart_gap: Any = 5.0,
-    left_out: NDArray[np.bool_] | None = None,
+    left_out: Bools | None = None,
     progress: Stage = no_stage,
 ) -> xr.Dataset:
     """Reduce a log to statistics of blocks of equal length: means, band powers, sample counts.
@@ -129,7 +128,7 @@ def reduce_log(
     return label_statistics(work, log, restart=duration_seconds(restart_gap, "restart_gap"))
 
 
-def pair_indices(blocks: xr.Dataset) -> NDArray[np.int64]:
+def pair_indices(blocks: xr.Dataset) -> Ints:
     """Return the indices of the first and of the second axes of all pairs, (2, pair)."""
     axes = blocks["axis"].values.tolist()
     sides = [[axes.index(axis) for axis in blocks[name].values] for name in ("first", "second")]
@@ -141,7 +140,7 @@ def measured(blocks: xr.Dataset, name: str) -> xr.DataArray:
     return blocks[f"measured_{name}"] if f"measured_{name}" in blocks else blocks[name]
 
 
-def noise_at_orders(blocks: xr.Dataset, expected: Array) -> Array:
+def noise_at_orders(blocks: xr.Dataset, expected: Floats) -> Floats:
     """Return the noise density near the rotation orders, as expected or as measured next to them.
 
     Waves unrelated to the tool, such as those of the ground, have the same power at an order as

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.diagnose.reduce.accumulate import (
     CHANNEL_PARTS,
     LAGGED_CHANNEL_PREFIXES,
@@ -25,7 +25,6 @@ from gyrostab.schema import GAP_CAUSES, texts
 from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
-Array = NDArray[np.float64]
 _MAX_SMOOTHING_BLOCKS = 2.0  # longest time scale of the smoothing of a channel; design choice
 _STEP_VALUES_PER_BLOCK = 256  # values from which the quantization step is found; limits time
 MIN_MEAN_SHARE = 0.1  # of a block that must be present for its mean; design choice
@@ -66,7 +65,7 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     sticks = np.isfinite(centres)[:, None]
     stuck = np.where(sticks, np.rint(repeats * per_repeat[:, None]).astype(np.int64), stuck)
     line_total, line_square = np.moveaxis(work.line_counts, -1, 0)
-    weight: Array = np.zeros(line_total.shape)
+    weight: Floats = np.zeros(line_total.shape)
     np.divide(line_total**2, line_square, where=line_square > 0, out=weight)
     weight *= _equal_block_share(by_name["power"][axes], by_name["shape"], present, weight.shape[1])
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -120,9 +119,7 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     return xr.Dataset(variables, coords=coordinates, attrs=attrs)
 
 
-def _equal_block_share(
-    power: Array, shape: Array, samples: NDArray[np.int64], part_count: int
-) -> Array:
+def _equal_block_share(power: Floats, shape: Floats, samples: Ints, part_count: int) -> Floats:
     """Return the equivalent share of equal-power blocks of each part, (axis, part).
 
     A few noisy blocks carry all the weight of a mean.
@@ -146,13 +143,13 @@ def _equal_block_share(
     return np.minimum(out, 1.0)
 
 
-def _record_range(moments: Array) -> tuple[Array, Array]:
+def _record_range(moments: Floats) -> tuple[Floats, Floats]:
     """Return the smallest and largest value of every axis, (axis, 1)."""
     lowest = np.fmin.reduce(moments[..., 3], axis=1, keepdims=True)
     return lowest, np.fmax.reduce(moments[..., 4], axis=1, keepdims=True)
 
 
-def _count_at_range_ends(moments: Array, counts: NDArray[np.int64]) -> NDArray[np.int64]:
+def _count_at_range_ends(moments: Floats, counts: Ints) -> Ints:
     """Keep counts at both ends (axis, block, 2) where those of a block are those of the record."""
     lowest, highest = _record_range(moments)
     at_top = (moments[..., 4] == highest) & (lowest < highest)
@@ -160,7 +157,7 @@ def _count_at_range_ends(moments: Array, counts: NDArray[np.int64]) -> NDArray[n
 
 
 def _cross_spectra(
-    work: Accumulator, by_name: Mapping[str, NDArray[Any]], log: xr.Dataset
+    work: Accumulator, by_name: Mapping[str, Array], log: xr.Dataset
 ) -> dict[str, Any]:
     """Return cross-spectra of the axes, and of each axis with the channels on the log's time."""
     axes = work.axes
@@ -186,7 +183,7 @@ def _cross_spectra(
 
 
 def _channel_means(
-    work: Accumulator, by_name: Mapping[str, NDArray[Any]], log: xr.Dataset
+    work: Accumulator, by_name: Mapping[str, Array], log: xr.Dataset
 ) -> dict[str, Any]:
     """Return block means of the channels; the rms of vibration."""
     variables: dict[str, Any] = {}
@@ -212,7 +209,7 @@ def _channel_means(
 
 
 def _channel_part_means(
-    work: Accumulator, by_name: Mapping[str, NDArray[Any]], log: xr.Dataset
+    work: Accumulator, by_name: Mapping[str, Array], log: xr.Dataset
 ) -> dict[str, Any]:
     """Return smoothed channels in parts of the blocks, if sampled often enough."""
     variables: dict[str, Any] = {}
@@ -298,9 +295,7 @@ def _make_coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     return label_variables(arrays, COORDINATES)
 
 
-def _make_attributes(
-    work: Accumulator, log: xr.Dataset, present: NDArray[np.int64]
-) -> dict[str, Any]:
+def _make_attributes(work: Accumulator, log: xr.Dataset, present: Ints) -> dict[str, Any]:
     end = grid_times(work.start, work.rate, log.sizes["time"])
     return {
         "start": f"{format_stamp(work.start)}Z",

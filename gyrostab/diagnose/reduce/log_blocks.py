@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.diagnose.reduce.aligned_channels import interpolate_linearly, read_clock
 from gyrostab.schema import find_unusable_channels, log_channels, signal_name
 from gyrostab.simulate.drivers import make_source
@@ -16,7 +16,6 @@ from gyrostab.store import lazy
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
 _SAMPLES_PER_READ = 2**20  # over all rows, unless a chunk holds more; limits memory
 _SAMPLES_PER_BATCH = 2**19  # over all rows; limits memory
 _CHANNEL_VALUES_PER_READ = 2**22  # limits memory
@@ -28,7 +27,7 @@ class BlockBatch(NamedTuple):
     first: int  # index of the first block
     #: (row, block, sample): the axes [degree hour-1], then the channels on the log's time; NaN
     #: where missing.
-    values: Array
+    values: Floats
 
 
 def numeric_channels(log: xr.Dataset) -> tuple[list[str], list[str]]:
@@ -64,7 +63,7 @@ def read_batches(log: xr.Dataset, size: int) -> Iterator[BlockBatch]:
         remainder = values[:, block_count * size :].copy()  # a copy, to free the other values
 
 
-def _read_rates(log: xr.Dataset) -> Iterator[Array]:
+def _read_rates(log: xr.Dataset) -> Iterator[Floats]:
     """Read rates and channels; the rate from two angles belongs to the time of the first."""
     import dask
 
@@ -72,7 +71,7 @@ def _read_rates(log: xr.Dataset) -> Iterator[Array]:
     axes = log.sizes["axis"]
     signal = log[name].transpose("axis", "time").data
     channels = [log[channel].data for channel in numeric_channels(log)[0]]
-    last_angle: Array | None = None
+    last_angle: Floats | None = None
     for low, high in _split_at_chunks(signal, axes + len(channels)):
         parts = dask.compute(signal[:, low:high], *(channel[low:high] for channel in channels))
         values = np.concatenate([np.atleast_2d(part) for part in parts], dtype=np.float64)
@@ -110,7 +109,7 @@ def is_rms_channel(name: str) -> bool:
     return name.startswith("vibration")
 
 
-def channel_means(log: xr.Dataset, name: str, edges: NDArray[np.int64], *, rms: bool) -> Array:
+def channel_means(log: xr.Dataset, name: str, edges: Ints, *, rms: bool) -> Floats:
     """Average a channel with its own time stamps over intervals, interpolating empty intervals.
 
     The ends of the intervals rise [ns since 1970]. The mean, or the root mean square, is NaN where

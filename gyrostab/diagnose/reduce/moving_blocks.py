@@ -10,15 +10,14 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_propagation
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.noise import NORMAL_95
 from gyrostab.progress import Stage, no_stage
 
-Array = NDArray[np.float64]
 #: Share of the blocks whose means lie closest together, and the width of the central quarter of a
 #: normal law in standard deviations: 2 * 0.3186.
 CORE_SHARE, CORE_WIDTH_SIGMA = 0.25, 0.637
@@ -30,7 +29,7 @@ REST_ROUNDS = 3  # in which centre and scatter at rest are refined
 _KEPT_STATISTICS = ("mean", "power", "cross")
 
 
-def moving_blocks(blocks: xr.Dataset, *, settings: Settings = DEFAULTS) -> NDArray[np.bool_]:
+def moving_blocks(blocks: xr.Dataset, *, settings: Settings = DEFAULTS) -> Bools:
     """Find the blocks (axis, block) in which an axis moves far beyond its scatter at rest.
 
     Examples
@@ -50,7 +49,7 @@ def sample_range(blocks: xr.Dataset) -> float:
     return float(np.ptp(blocks["range_end"].values))
 
 
-def moving_blocks_of_axis(mean: Array, span: float, settings: Settings) -> NDArray[np.bool_]:
+def moving_blocks_of_axis(mean: Floats, span: float, settings: Settings) -> Bools:
     """Find the moving blocks of one axis of a record whose samples have the range `span`.
 
     The level at rest is where a quarter of the means lie closest together, if a third of the record
@@ -69,8 +68,8 @@ def moving_blocks_of_axis(mean: Array, span: float, settings: Settings) -> NDArr
 
 
 def _find_motion(
-    mean: Array, rest: tuple[float, float], min_blocks: float, span: float, settings: Settings
-) -> NDArray[np.bool_]:
+    mean: Floats, rest: tuple[float, float], min_blocks: float, span: float, settings: Settings
+) -> Bools:
     """Find the blocks that move away from rest (centre, scatter); none if too few are at rest."""
     good = np.isfinite(mean)
     nothing = np.zeros(mean.size, np.bool_)
@@ -107,14 +106,14 @@ def _without_zero(scale: float, span: float) -> float:
     return scale if scale > ROUNDING * span else EQUAL_SCATTER * span
 
 
-def _steadiest_stretch(mean: Array, size: int) -> tuple[float, float]:
+def _steadiest_stretch(mean: Floats, size: int) -> tuple[float, float]:
     """Return centre and scatter of the consecutive means that scatter least."""
     stretches = np.lib.stride_tricks.sliding_window_view(mean, size)
     steadiest = stretches[stretches.std(axis=1).argmin()]
     return float(np.median(steadiest)), float(steadiest.std(ddof=1))
 
 
-def _closest_quarter(mean: Array) -> tuple[float, float]:
+def _closest_quarter(mean: Floats) -> tuple[float, float]:
     """Return centre and scatter of the quarter of the means that lie closest together."""
     ordered = np.sort(mean)
     size = int(np.ceil(CORE_SHARE * mean.size))
@@ -126,7 +125,7 @@ def _closest_quarter(mean: Array) -> tuple[float, float]:
 def without_motion(
     log: xr.Dataset,
     blocks: xr.Dataset,
-    moving: NDArray[np.bool_],
+    moving: Bools,
     *,
     restart_gap: Any = 5.0,
     progress: Stage = no_stage,

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from gyrostab.arrays import Array, Bools, Floats, Ints
 from gyrostab.kernels.spectra.outliers import HISTOGRAM, departures, histogram_edge, peaks
 
-Array = NDArray[np.float64]
 #: Expected number of false outliers of an axis in a record of Gaussian noise. Design choice.
 EXPECTED_FALSE_OUTLIERS = 0.02
 _MIN_OUTLIER_SIGMA = 4.0  # deviations of the block; lower peaks are not stored; design choice
@@ -31,12 +31,12 @@ _NORMAL_MEDIAN_ABS = 0.6745  # median of |x| of a standard normal variable
 class Peaks(NamedTuple):
     """Isolated extreme samples of an axis, from `gyrostab.kernels.spectra.outliers.peaks`."""
 
-    block: NDArray[np.int64]
-    size: Array
-    level: Array
+    block: Ints
+    size: Floats
+    level: Floats
 
 
-def find_peaks(values: Array, histogram: NDArray[np.uint32]) -> Peaks:
+def find_peaks(values: Floats, histogram: NDArray[np.uint32]) -> Peaks:
     """Find the peaks of some blocks (block, sample) of an axis that may be outliers.
 
     The histogram (block, `HISTOGRAM`) of departures by size is updated.
@@ -70,7 +70,7 @@ def outlier_limit(samples: float) -> float:
 
 def count_outliers(
     histogram: NDArray[np.uint32], peaks: Sequence[Sequence[Peaks]]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[Ints, Ints]:
     """Count outliers, and weigh them: beyond twice the limit one counts three times.
 
     The limit is the number of standard deviations of the departures that Gaussian noise as long as
@@ -120,7 +120,7 @@ def count_outliers(
     return number, outliers
 
 
-def _fluctuating_level_limit(histogram: NDArray[np.uint32], scale: Array) -> float:
+def _fluctuating_level_limit(histogram: NDArray[np.uint32], scale: Floats) -> float:
     """Return the limit in deviations of an axis whose noise level may fluctuate within blocks."""
     total = float(histogram.sum())
     limit = outlier_limit(total)
@@ -137,7 +137,7 @@ def _fluctuating_level_limit(histogram: NDArray[np.uint32], scale: Array) -> flo
     return float(np.interp(-np.log(2.0 * ndtr(-limit)), -beyond, tried_limits))
 
 
-def _count_between(histogram: NDArray[np.uint32], scale: Array, low: float, high: float) -> float:
+def _count_between(histogram: NDArray[np.uint32], scale: Floats, low: float, high: float) -> float:
     """Count departures from `low` to `high` deviations; a split bin is shared as if normal."""
     edges = (
         np.concatenate([[0.0], histogram_edge(np.arange(1, HISTOGRAM + 1))])
@@ -155,7 +155,7 @@ def _count_between(histogram: NDArray[np.uint32], scale: Array, low: float, high
     return float((histogram * share).sum())
 
 
-def _deviation_from_median(histogram: NDArray[np.int64]) -> Array:
+def _deviation_from_median(histogram: Ints) -> Floats:
     """Return the standard deviation from the median, without zeros, which held samples cause."""
     total = np.cumsum(histogram[..., 1:], axis=-1)
     half = total[..., -1] / 2.0
@@ -168,7 +168,7 @@ def _deviation_from_median(histogram: NDArray[np.int64]) -> Array:
     )
 
 
-def simultaneous_zeros(values: Array) -> NDArray[np.int64]:
+def simultaneous_zeros(values: Floats) -> Ints:
     """Count exact zeros that all axes have at once; on a single axis, zeros in runs.
 
     Lost samples that were filled with zeros look like this. A loop that sticks at zero does so in
@@ -197,7 +197,7 @@ def simultaneous_zeros(values: Array) -> NDArray[np.int64]:
     return np.asarray(is_lost.sum(axis=-1))
 
 
-def simultaneous_samples(present: NDArray[np.bool_]) -> dict[tuple[bool, ...], NDArray[np.int64]]:
+def simultaneous_samples(present: Bools) -> dict[tuple[bool, ...], Ints]:
     """Count the samples of each block that two or more axes have at once, by set of axes.
 
     Returned for each set of axes is the number (block,) of instants at which exactly these have a
@@ -222,12 +222,12 @@ def simultaneous_samples(present: NDArray[np.bool_]) -> dict[tuple[bool, ...], N
 
 
 def zeros_beyond_chance(
-    together: NDArray[Any],
-    zeros: NDArray[Any],
-    samples: NDArray[Any],
-    subset: NDArray[np.bool_],
-    at_once: NDArray[Any],
-) -> NDArray[np.int64]:
+    together: Array,
+    zeros: Array,
+    samples: Array,
+    subset: Bools,
+    at_once: Array,
+) -> Ints:
     """Subtract the zeros that independent axes, or a single axis, have at once by chance.
 
     Zeros of `simultaneous_zeros`, all zeros, and samples are by (..., axis, block). A subset of the
@@ -250,7 +250,7 @@ def zeros_beyond_chance(
     return np.asarray(np.maximum(together - np.rint(chance), 0), np.int64)
 
 
-def probability_all_zero(share: Array, subset: NDArray[np.bool_]) -> Array:
+def probability_all_zero(share: Floats, subset: Bools) -> Floats:
     """Return the probability (..., subset, block) that all axes of a subset are zero at once.
 
     The shares of zeros are (..., axis, block).
@@ -258,7 +258,7 @@ def probability_all_zero(share: Array, subset: NDArray[np.bool_]) -> Array:
     return np.asarray(np.where(subset[..., None], share[..., None, :, :], 1.0).prod(axis=-2))
 
 
-def quantization_step(values: Array) -> float:
+def quantization_step(values: Floats) -> float:
     """Find the quantization step of values with any offset; 0 if there is none, or it is too fine.
 
     Examples
@@ -302,21 +302,21 @@ def quantization_step(values: Array) -> float:
     return 0.0
 
 
-def _frequent_levels(levels: Array, times: NDArray[np.int64], rare: float) -> Array:
+def _frequent_levels(levels: Floats, times: Ints, rare: float) -> Floats:
     """Drop the rarest levels, `rare` of the values, as spikes; empty if the rest has no grid."""
     order = np.argsort(times, kind="stable")
     common = np.sort(order[np.cumsum(times[order]) > rare * times.sum()])
     return levels[common] if common.size and times[common].min() > 1 else levels[:0]
 
 
-def _is_step_of_large_values(levels: Array, step: float, fine: float) -> bool:
+def _is_step_of_large_values(levels: Floats, step: float, fine: float) -> bool:
     """Return whether the larger half of the values has this step, as on a grid of equal steps."""
     distances = np.diff(levels[np.abs(levels) >= np.median(np.abs(levels))])
     large_step = _common_divisor(distances[distances > fine], fine)
     return abs(large_step - step) <= _STEP_ERROR_SHARE * step
 
 
-def _off_grid_share(levels: Array, times: NDArray[np.int64], step: float, fine: float) -> float:
+def _off_grid_share(levels: Floats, times: Ints, step: float, fine: float) -> float:
     """Return the share of values off the grid of this step through the most common value."""
     departure = np.abs(levels - levels[times.argmax()]) / step
     step_count = np.round(departure)
@@ -324,7 +324,7 @@ def _off_grid_share(levels: Array, times: NDArray[np.int64], step: float, fine: 
     return float(times[off].sum() / times.sum())
 
 
-def _common_divisor(distances: Array, fine: float) -> float:
+def _common_divisor(distances: Floats, fine: float) -> float:
     """Return the largest common divisor of distances with `fine` errors; 0 if there is none."""
     step = float(distances.min())
     while step > _MIN_STEP_ERRORS * fine:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Bools, Complexes, Floats, Ints
 from gyrostab.diagnose.reduce.log_blocks import finite_range, numeric_channels
 from gyrostab.errors import UnitError
 from gyrostab.physics.phase import turns_of_samples
@@ -17,7 +17,6 @@ from gyrostab.simulate.drivers import Source, make_source
 from gyrostab.time.grid import first_stamp, grid_times
 from gyrostab.units import INNER, parse_unit
 
-Array = NDArray[np.float64]
 #: Multiples of the tool rotation that are measured.
 HARMONICS = (1, 2, 3)
 #: Turns per block from an order at which its noise is measured.
@@ -45,7 +44,7 @@ class RotationOrders:
         self.carry: float | None = None
         self.turns = 0.0
 
-    def read_turns(self, block_range: slice) -> tuple[Array, Array]:
+    def read_turns(self, block_range: slice) -> tuple[Floats, Floats]:
         """Return the turns up to the middle of each sample, and within it, (block, sample) each.
 
         The turns are counted from the start, less a number of whole turns.
@@ -59,12 +58,12 @@ class RotationOrders:
 
     def measure(
         self,
-        turns: Array,
-        inside: Array,
-        centred: Array,
-        counts: NDArray[np.int64],
+        turns: Floats,
+        inside: Floats,
+        centred: Floats,
+        counts: Ints,
         min_samples: float,
-    ) -> dict[str, NDArray[Any]]:
+    ) -> dict[str, Array]:
         """Demodulate blocks of the axes (axis, block, sample), zero where samples are missing."""
         often = inside.sum(axis=-1)
         enough = (np.abs(often) >= 1.0) & (counts >= min_samples)
@@ -93,9 +92,7 @@ class RotationOrders:
         }
 
 
-def _mean_of_present(
-    values: NDArray[np.complex128], present: NDArray[np.bool_]
-) -> NDArray[np.complex128]:
+def _mean_of_present(values: Complexes, present: Bools) -> Complexes:
     """Average values (block, sample) over the samples present (axis, block, sample), else all."""
     used = present | ~present.any(axis=-1, keepdims=True)
     return np.asarray(np.einsum("bs,abs->ab", values, used) / used.sum(axis=-1))
@@ -104,18 +101,18 @@ def _mean_of_present(
 class _Harmonics(NamedTuple):
     """Harmonics of the rotation in each block."""
 
-    amplitudes: NDArray[np.complex128]  # (axis, block, harmonic): NaN where not fitted
-    samples: Array  # (axis, block, harmonic): of an even rotation with the same error
-    residual: Array  # (axis, block, sample): values less the harmonics; zero where missing
+    amplitudes: Complexes  # (axis, block, harmonic): NaN where not fitted
+    samples: Floats  # (axis, block, harmonic): of an even rotation with the same error
+    residual: Floats  # (axis, block, sample): values less the harmonics; zero where missing
     #: (axis, block, harmonic, neighbour): share of white noise in the residual at `_NEIGHBOURS`
-    noise_left: Array
+    noise_left: Floats
 
 
 def _fit_harmonics(
-    values: Array,
-    wheels: Sequence[NDArray[np.complex128]],
-    enough: NDArray[np.bool_],
-    is_sampled: NDArray[np.bool_],
+    values: Floats,
+    wheels: Sequence[Complexes],
+    enough: Bools,
+    is_sampled: Bools,
 ) -> _Harmonics:
     """Fit a constant and harmonics to the samples of each block by least squares.
 
@@ -171,8 +168,8 @@ def make_rotation_orders(log: xr.Dataset, length: int, rate: float) -> RotationO
 
 
 def _level_near_order(
-    turned: NDArray[np.complex128], noise_left: Array, often: Array, harmonic: int
-) -> Array:
+    turned: Complexes, noise_left: Floats, often: Floats, harmonic: int
+) -> Floats:
     """Measure the mean power (axis, block) of the noise next to a harmonic, NaN if unknown.
 
     The samples (axis, block, sample) have no harmonics, and are demodulated by this one; of the

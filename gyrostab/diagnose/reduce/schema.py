@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Floats
 from gyrostab.noise import LAWS, TERMS
 from gyrostab.units import INNER
 
@@ -229,7 +229,7 @@ def label_variables(
     }
 
 
-def axis_values(dataset: xr.Dataset, name: str, axis: str | int) -> NDArray[np.float64]:
+def axis_values(dataset: xr.Dataset, name: str, axis: str | int) -> Floats:
     """Return the values of a variable on an axis, by its name or index.
 
     A search asks for them ten thousands of times, where the selections of xarray take much longer.
@@ -239,9 +239,7 @@ def axis_values(dataset: xr.Dataset, name: str, axis: str | int) -> NDArray[np.f
     return np.asarray(np.moveaxis(variable.values, variable.dims.index("axis"), 0)[row])
 
 
-def weighted_mean(
-    values: NDArray[Any], weight: NDArray[np.float64], axis: int = 0
-) -> tuple[NDArray[Any], NDArray[np.float64]]:
+def weighted_mean(values: Array, weight: Floats, axis: int = 0) -> tuple[Array, Floats]:
     """Average over an axis where value and weight are known, with the sum of the weights.
 
     The mean is 0 where nothing is known.

@@ -10,13 +10,12 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES, level_around
 from gyrostab.kernels.spectra.periodogram import ordinates, taper
 
-Array = NDArray[np.float64]
 _MAX_SAMPLES = 2**21  # of a segment; bounds memory
 #: Segments are transformed whole, and in parts, for lines whose phase wanders.
 _PARTS = (1, 8)
@@ -49,7 +48,7 @@ class _Spectrum:
         # (axis, band): sum of the levels, and that of the noisiest periodogram
         self.band_total, self.band_largest = np.zeros((2, axes, self.edges.size))
 
-    def add(self, axis: int, values: Array, rate: float) -> None:
+    def add(self, axis: int, values: Floats, rate: float) -> None:
         """Add the periodogram of some samples of an axis, if enough are present."""
         present = np.isfinite(values)
         if np.count_nonzero(present) < _MIN_SHARE * self.size:
@@ -66,7 +65,7 @@ class _Spectrum:
         self.band_total[axis] += level
         self.band_largest[axis] = np.maximum(self.band_largest[axis], level)
 
-    def equal_count(self) -> Array:
+    def equal_count(self) -> Floats:
         """Return (axis, band) how many equal periodograms have a sum with this upper tail.
 
         A noisier stretch leaves fewer: with a single one, the sum is an exponential variable.
@@ -91,7 +90,7 @@ class SineSearch:
         self.filled = 0
         self.spectra = [_Spectrum(axes, size) for size in sizes]
 
-    def add(self, values: Array) -> None:
+    def add(self, values: Floats) -> None:
         """Add the samples (axis, sample) that follow; NaN where missing."""
         while self.spectra and values.shape[1]:
             count = min(values.shape[1], self.segment.shape[1] - self.filled)
@@ -105,7 +104,7 @@ class SineSearch:
                         for axis, part in enumerate(self.segment[:, begin : begin + size]):
                             spectrum.add(axis, part, self.rate)
 
-    def strongest(self, lines: Array) -> dict[str, Any]:
+    def strongest(self, lines: Floats) -> dict[str, Any]:
         """Return the strongest sine nearest to each line (frequencies [Hz], evenly spaced).
 
         The variables are described in `gyrostab.diagnose.reduce.schema.BLOCK_STATISTICS`; the
@@ -133,8 +132,8 @@ class SineSearch:
         return out
 
     def _search_spectrum(
-        self, spectrum: _Spectrum, lines: Array
-    ) -> tuple[NDArray[np.int64], Array, dict[str, Array]] | None:
+        self, spectrum: _Spectrum, lines: Floats
+    ) -> tuple[Ints, Floats, dict[str, Floats]] | None:
         """Return lines, the nats of all axes, and the results of `strongest`; None if too short."""
         split = self.segment.shape[1] // spectrum.size
         step = self.rate / (_FINER * spectrum.size)
@@ -188,7 +187,7 @@ class SineSearch:
         return place[chosen], total[chosen], arrays
 
 
-def _share_in_line(window: Array) -> float:
+def _share_in_line(window: Floats) -> float:
     """Return the share of a sine's power in the `LEAK_LINES` on either side of its frequency.
 
     Lost samples (zeros of the window) spread the rest over the spectrum.
@@ -203,7 +202,7 @@ def _share_in_line(window: Array) -> float:
     return float(total / (_FINER * size * (window**2).sum()))
 
 
-def sine_factors(ratio: Array, count: Array | float) -> Array:
+def sine_factors(ratio: Floats, count: Floats | float) -> Floats:
     r"""Return the log Bayes factor of a sine from mean periodograms relative to noise.
 
     With a sine of random phase whose expected gain is E nats, each of n periodograms is 1 + E / n

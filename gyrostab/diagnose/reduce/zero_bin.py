@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gyrostab.arrays import Bools, Floats, Ints
+
 #: Bins whose widths are measured: the zero bin, and its two neighbours together.
 BINS = ("zero", "next")
 _TRUNCATED_WIDTHS_STEPS = np.array([2.0, 1.0])  # bin widths under truncation; derived
@@ -30,7 +30,7 @@ _MIN_STICKING_RUNS = 5  # of equal samples at one value; design choice
 _MIN_SCATTER_STEPS = 2.0  # scatter of values on a grid, of which the most common has 28 % of runs
 
 
-def bin_widths(values: Array, step: float) -> tuple[Array, Array]:
+def bin_widths(values: Floats, step: float) -> tuple[Floats, Floats]:
     """Measure the widths of the zero bin and of its neighbours, in steps, with standard errors.
 
     The logarithms of the counts of the other bins are a parabola in the rate, as in normal noise.
@@ -85,7 +85,7 @@ def bin_widths(values: Array, step: float) -> tuple[Array, Array]:
     return width, error
 
 
-def empty_zone(values: Array) -> tuple[float, float]:
+def empty_zone(values: Floats) -> tuple[float, float]:
     """Measure the half width of a zone around zero whose outer part is empty, and its error.
 
     A loop that sticks near zero, and is right outside of its zone, leaves such a gap: between the
@@ -113,7 +113,7 @@ def empty_zone(values: Array) -> tuple[float, float]:
     return float(outer[gap]), float((outer[gap] - inner[gap]) / beyond[gap])
 
 
-def sticking_value(values: Array, step: float) -> tuple[float, float]:
+def sticking_value(values: Floats, step: float) -> tuple[float, float]:
     """Find the value other than 0 at which an axis sticks, and its samples per repeated sample.
 
     Held samples repeat a different value each time; a loop sticks at one value, and most runs of
@@ -142,18 +142,16 @@ def sticking_value(values: Array, step: float) -> tuple[float, float]:
     return float(levels[most]), float((values == levels[most]).sum() / same.sum())
 
 
-def sticking_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
+def sticking_axes(blocks: xr.Dataset) -> Bools:
     """Find the axes (axis,) that stick at a value other than 0; see `sticking_value`."""
     return np.asarray(np.isfinite(blocks["zone_centre"].values))
 
 
-def _parabola_columns(at: Array, reach: float) -> Array:
+def _parabola_columns(at: Floats, reach: float) -> Floats:
     return np.stack([np.ones(at.size), at / reach, np.square(at / reach)], axis=1)
 
 
-def _fit_log_counts(
-    at: Array, count: NDArray[np.int64], reach: float
-) -> tuple[Array, Array] | None:
+def _fit_log_counts(at: Floats, count: Ints, reach: float) -> tuple[Floats, Floats] | None:
     """Fit a parabola to the logarithms of Poisson counts; return it with its covariance."""
     columns = _parabola_columns(at, reach)
     if (count > 0).sum() <= columns.shape[1]:
@@ -173,7 +171,7 @@ def _fit_log_counts(
     return None
 
 
-def truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
+def truncated_axes(blocks: xr.Dataset) -> Bools:
     """Find the axes (axis,) whose rate is truncated towards zero on its quantization grid.
 
     The axes are judged together, because one logger writes all of them in the same way.
@@ -195,7 +193,7 @@ def truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
     return np.asarray(quantized & sure)
 
 
-def possibly_truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
+def possibly_truncated_axes(blocks: xr.Dataset) -> Bools:
     """Find the quantized axes whose bins do not rule out truncation; see `truncated_axes`."""
     width, error, is_measured = _read_widths(blocks)
     return np.asarray(
@@ -204,18 +202,18 @@ def possibly_truncated_axes(blocks: xr.Dataset) -> NDArray[np.bool_]:
     )
 
 
-def _read_widths(blocks: xr.Dataset) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _read_widths(blocks: xr.Dataset) -> tuple[Floats, Floats, Bools]:
     """Return the widths, their errors, and which axes have them."""
     width, error = (blocks[name].values for name in ("bin_width", "bin_width_stderr"))
     return width, error, np.isfinite(width).all(axis=1) & np.isfinite(error).all(axis=1)
 
 
-def _is_like_truncation(width: Array, error: Array) -> NDArray[np.bool_]:
+def _is_like_truncation(width: Floats, error: Floats) -> Bools:
     misfit = np.abs(width - _TRUNCATED_WIDTHS_STEPS)
     return np.asarray((misfit <= _allowed_misfit(error)).all(axis=1))
 
 
-def _allowed_misfit(error: Array) -> Array:
+def _allowed_misfit(error: Floats) -> Floats:
     """Return by how much widths (axis, bin) may differ from those of truncation."""
     model_error = _WIDTH_MODEL_ERROR_SHARE * _TRUNCATED_WIDTHS_STEPS
     return np.asarray(_MAX_MISFIT_STDERRS * np.hypot(error, model_error))

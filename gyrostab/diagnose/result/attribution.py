@@ -7,8 +7,8 @@ from functools import cache, partial
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_motion
 from gyrostab.diagnose.identify.identification import Selection, components_of
 from gyrostab.diagnose.locate.mismatches import Region
@@ -21,15 +21,14 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS, find_statistic
 from gyrostab.diagnose.statistics.sample_counts import find_anomalous_blocks, mask_anomalous_blocks
 
-Array = NDArray[np.float64]
 MAX_SPANS = 6  # more intervals than that are reported as the whole record
 #: Name, scores and standardised scores of each statistic.
-_Scores = Sequence[tuple[str, xr.Dataset, NDArray[np.float64]]]
+_Scores = Sequence[tuple[str, xr.Dataset, Floats]]
 
 
 def active_blocks(
     identification: Selection, blocks: xr.Dataset, *, settings: Settings = DEFAULTS
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Return the blocks in which an effect acts, from its designs and the rotation of the tool.
 
     These are all blocks when neither depends on time.
@@ -57,7 +56,7 @@ def active_blocks(
     return is_active if is_active.any() else np.ones(block_count, bool)
 
 
-def _rest_level(size: Array, settings: Settings) -> Array:
+def _rest_level(size: Floats, settings: Settings) -> Floats:
     """Return the level of every column (block, column) at rest.
 
     It is zero where the column stays near zero for a while; else the median, because the constant
@@ -67,9 +66,7 @@ def _rest_level(size: Array, settings: Settings) -> Array:
     return np.where(still.mean(axis=0) >= settings.rest_share, 0.0, np.median(size, axis=0))
 
 
-def join_blocks(
-    is_inside: NDArray[np.bool_], begin: Array, end: Array
-) -> list[tuple[float, float]]:
+def join_blocks(is_inside: Bools, begin: Floats, end: Floats) -> list[tuple[float, float]]:
     """Join blocks to stretches of time [s], with short pauses bridged.
 
     An intermittent effect with many stretches gets the whole record.

@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import bdtrc
 
-Array = NDArray[np.float64]
+from gyrostab.arrays import Floats
+
 #: Probability that lines without relation form a family, below which they are one.
 MAX_CHANCE = 0.05
 #: More lines without a family are one shaped spectrum, not as many findings. Design choice.
@@ -72,7 +72,7 @@ def find_families(
 
 
 def _try_families(
-    lines: Array, resolution: Array, bandwidth: float
+    lines: Floats, resolution: Floats, bandwidth: float
 ) -> Iterator[tuple[float, str, list[int]]]:
     """Yield the probability by chance, the label and the members of each possible family."""
     for first, error in zip(lines, resolution, strict=True):  # a low multiple
@@ -97,8 +97,8 @@ def _try_families(
 
 
 def _judge_family(
-    lines: Array,
-    resolution: Array,
+    lines: Floats,
+    resolution: Floats,
     start: _Spacing,
     *,
     tried: int,
@@ -126,7 +126,7 @@ def _judge_family(
 
 
 def _collect_multiples(
-    distance: Array, resolution: Array, start: _Spacing, highest: float
+    distance: Floats, resolution: Floats, start: _Spacing, highest: float
 ) -> tuple[float, list[int], list[float]]:
     """Return a refined spacing, the lines at multiples of it, and what was allowed for each line.
 

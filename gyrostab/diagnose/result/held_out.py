@@ -7,12 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import compress
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Bools, Floats
 from gyrostab.diagnose.baseline.calibrate import calibrate_on_known
 from gyrostab.diagnose.baseline.expected_statistics import reduced_shape
 from gyrostab.diagnose.estimate.conditioned_baseline import (
@@ -33,11 +32,11 @@ from gyrostab.diagnose.result.attribution import active_blocks
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
-from gyrostab.diagnose.statistics.scores import Array, Windows, cube_root_score
+from gyrostab.diagnose.statistics.scores import Windows, cube_root_score
 from gyrostab.noise import NORMAL_95
 
 #: Fits a baseline to the blocks where its argument, a mask, is true.
-FitBaseline = Callable[[NDArray[np.bool_]], xr.Dataset]
+FitBaseline = Callable[[Bools], xr.Dataset]
 STRETCH_S = 100.0  # length of a held-out stretch; longer ones would hide a whole event
 MIN_STRETCHES = 36  # in records shorter than an hour the stretches are shorter instead
 FORECAST_FROM_SHARE = 0.7  # share of the record that a forecast begins from
@@ -77,17 +76,17 @@ def measure_evidence(
     settings = identifications.state.settings
     calibrated: dict[bytes, xr.Dataset] = {}  # by the known blocks
 
-    def calibrate(known: NDArray[np.bool_]) -> xr.Dataset:
+    def calibrate(known: Bools) -> xr.Dataset:
         place = known.tobytes()
         if place not in calibrated:
             calibrated[place] = calibrate_on_known(blocks, baseline, known, settings=settings)
         return calibrated[place]
 
-    def before(known: NDArray[np.bool_]) -> xr.Dataset:
+    def before(known: Bools) -> xr.Dataset:
         return expected_baseline(with_course, calibrate(known), known)
 
     def train(
-        chosen: Identifications, known: NDArray[np.bool_], is_left_out: Sequence[bool] = ()
+        chosen: Identifications, known: Bools, is_left_out: Sequence[bool] = ()
     ) -> xr.Dataset:
         noise = recalibrate(chosen, calibrate(known), first, known)
         renewed = with_noise(chosen, noise)
@@ -221,9 +220,9 @@ def held_out(
     windows = cut_stretches(blocks)
     fold_of_window = np.arange(windows.first.size) % FOLDS
     stretches = np.repeat(fold_of_window, windows.length)
-    gains: list[Array] = []
+    gains: list[Floats] = []
     moves = False
-    squares: dict[str, list[Array]] = {"before": [], "after": []}
+    squares: dict[str, list[Floats]] = {"before": [], "after": []}
     for fold in (stretches, *fold_blocks(blocks).values[1:]):
         gain = np.array([more_gain, 2.0 * abs(more_gain)])
         for number in range(FOLDS):
@@ -257,8 +256,8 @@ def held_out(
 
 
 def _compare_models(
-    blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset, held: NDArray[np.bool_]
-) -> Array:
+    blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset, held: Bools
+) -> Floats:
     """Return what one fitted model gains over another on held-out blocks [nats], and its variance.
 
     For the powers the variance follows from the scatter of their cells about `after`; for normal
@@ -288,9 +287,7 @@ def cut_stretches(blocks: xr.Dataset) -> Windows:
     return Windows(edge[:-1], edge[1:])
 
 
-def log_likelihood(
-    blocks: xr.Dataset, baseline: xr.Dataset, known: NDArray[np.bool_], held: NDArray[np.bool_]
-) -> float:
+def log_likelihood(blocks: xr.Dataset, baseline: xr.Dataset, known: Bools, held: Bools) -> float:
     """Return the log-likelihood of held-out blocks given the known blocks [nats].
 
     It leaves out a constant that depends only on the data.
@@ -308,7 +305,7 @@ def log_likelihood(
     return total
 
 
-def _power_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
+def _power_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Floats:
     """Return the log-likelihood of the band powers of every block, by gamma laws."""
     power, shape = blocks["power"].values, reduced_shape(blocks)
     spectrum = baseline["spectrum"].values
@@ -319,7 +316,7 @@ def _power_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
     )
 
 
-def _cross_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
+def _cross_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Floats:
     """Return what the cross-spectra of a model add in every block, by complex Wishart laws.
 
     Without cross-spectra they add zero.
@@ -353,9 +350,7 @@ def _cross_terms(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
     return np.asarray((-weight * (np.linalg.slogdet(expected)[1] + trace)).sum(axis=-1))
 
 
-def _mean_evidence(
-    blocks: xr.Dataset, baseline: xr.Dataset, axis: str, used: NDArray[np.bool_]
-) -> float:
+def _mean_evidence(blocks: xr.Dataset, baseline: xr.Dataset, axis: str, used: Bools) -> float:
     """Return the log-likelihood of the used block means with a free constant.
 
     It is averaged over the calibrated random walk and flicker.
@@ -373,7 +368,7 @@ def _mean_evidence(
     return products_mixture(products, weight - np.logaddexp.reduce(weight)).evidence
 
 
-def _allan_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Array:
+def _allan_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Floats:
     """Return squared scores of the Allan variance in disjoint windows of held-out stretches."""
     first, stop = [held.first], [held.stop]
     for length in {1, min(SHORT_WINDOW_BLOCKS, int((held.stop - held.first).min()))}:
@@ -393,8 +388,8 @@ def _allan_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Ar
     return np.asarray(z[np.isfinite(z)] ** 2)
 
 
-def _summarise_scores(squares: dict[str, list[Array]]) -> dict[str, float]:
-    def mean(values: NDArray[Any]) -> float:
+def _summarise_scores(squares: dict[str, list[Floats]]) -> dict[str, float]:
+    def mean(values: Array) -> float:
         return float(values.mean()) if values.size else np.nan
 
     cells = {name: np.concatenate(parts) for name, parts in squares.items()}
@@ -404,7 +399,7 @@ def _summarise_scores(squares: dict[str, list[Array]]) -> dict[str, float]:
     }
 
 
-def select_forecast_start(blocks: xr.Dataset) -> NDArray[np.bool_]:
+def select_forecast_start(blocks: xr.Dataset) -> Bools:
     """Select the blocks that a forecast of the others begins from."""
     return np.asarray(
         np.arange(blocks.sizes["block"]) < round(FORECAST_FROM_SHARE * blocks.sizes["block"])

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.diagnose.estimate.constant_rate import (
     constant_rates,
@@ -45,8 +44,6 @@ from gyrostab.noise import LAWS
 from gyrostab.physics.sampling import FAST_INSTRUMENT_SAMPLES, LoggerFilter
 from gyrostab.simulate.model import Model
 from gyrostab.wording import join_words
-
-Array = NDArray[np.float64]
 
 
 def recording_table(blocks: xr.Dataset) -> dict[str, Any]:

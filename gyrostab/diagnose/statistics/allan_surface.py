@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.wandering import allan_variance, expected_processes
 from gyrostab.diagnose.statistics.scores import (
-    Array,
     Windows,
     cumulative,
     sum_over_windows,
@@ -22,7 +22,7 @@ LENGTHS = (1, 5, 15)
 _INTEGRATION_POINTS = 256  # of the transfer function in one band, at least
 
 
-def allan_transfer(low: Array, high: Array, tau: Array, rate: float) -> Array:
+def allan_transfer(low: Floats, high: Floats, tau: Floats, rate: float) -> Floats:
     """Return the Allan variance (tau, band) per unit of two-sided density in each band [Hz].
 
     It is the integral of ``4 sin(pi f tau)^4 / (k sin(pi f / rate))^2``, k = tau rate, over the
@@ -117,7 +117,7 @@ def _surface_of_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
     white = baseline["mean_variance"].values
     walk = block * np.stack([expected_processes(baseline, row).walk for row in range(len(white))])
     sizes = [k for k in (1, 2, 4, 8, 16, 32) if 4 * k <= block_count]
-    surfaces: dict[str, list[Array]] = {"observed": [], "expected": [], "shape": []}
+    surfaces: dict[str, list[Floats]] = {"observed": [], "expected": [], "shape": []}
     for k in sizes:
         d2 = _mean_differences(means, k) ** 2 / 2.0
         expected = (
@@ -145,7 +145,7 @@ def _surface_of_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
     return joined
 
 
-def _mean_differences(means: Array, k: int) -> Array:
+def _mean_differences(means: Floats, k: int) -> Floats:
     """Return the mean of k blocks minus that of the k before; NaN if incomplete."""
     total = cumulative(np.where(np.isfinite(means), means, 0.0))
     lost = cumulative(~np.isfinite(means))
@@ -154,13 +154,13 @@ def _mean_differences(means: Array, k: int) -> Array:
     return _pad_end(difference, means.shape[-1])
 
 
-def _pair_variance(white: Array, k: int) -> Array:
+def _pair_variance(white: Floats, k: int) -> Floats:
     """Return the white variance of the differences of means of k blocks."""
     total = cumulative(np.where(np.isfinite(white), white, 0.0))
     return _pad_end((total[..., 2 * k :] - total[..., : -2 * k]) / k**2, white.shape[-1])
 
 
-def _walk_variance(walk: Array, k: int) -> Array:
+def _walk_variance(walk: Floats, k: int) -> Floats:
     """Return what random walks add to the variance of the differences of means of k blocks.
 
     `walk` (axis, block) is the growth of their variance in each block.
@@ -171,13 +171,13 @@ def _walk_variance(walk: Array, k: int) -> Array:
     return _pad_end(added, walk.shape[-1])
 
 
-def _pad_end(values: Array, size: int) -> Array:
+def _pad_end(values: Floats, size: int) -> Floats:
     """Append NaN up to the size of the record."""
     sides = [*[(0, 0)] * (values.ndim - 1), (0, size - values.shape[-1])]
     return np.pad(values, sides, constant_values=np.nan)
 
 
-def _slow_allan_variance(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -> Array:
+def _slow_allan_variance(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -> Floats:
     """Return the Allan variance of all but white noise, by axis, without walks of effects.
 
     In degree2 hour-2. Angle noise has the law of quantization.
@@ -196,7 +196,7 @@ def _slow_allan_variance(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -
     return np.asarray(total)
 
 
-def _gamma_shape(count: Any, k: int) -> Array:
+def _gamma_shape(count: Any, k: int) -> Floats:
     """Return the gamma shape of the mean of `count` overlapping terms in white noise."""
     region = np.concatenate([-np.ones(k), np.ones(k)])
     r2 = (np.correlate(region, region, mode="full")[2 * k - 1 :] / (2 * k)) ** 2

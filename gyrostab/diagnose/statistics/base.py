@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.diagnose.evidence.held_out import LinearModel, linear_model_factors
 from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
@@ -29,7 +29,6 @@ from gyrostab.diagnose.settings import Settings
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Windows
 
-Array = NDArray[Any]
 Sizes = Mapping[str, tuple[float, ...]]
 Region = Mapping[str, Any]
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from gyrostab.diagnose.evidence.sample_counts import hidden_by_grid
 from gyrostab.diagnose.predict.candidates import TIME_PARAMETER, Candidate, Prospect
@@ -30,8 +29,6 @@ from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Windows
 from gyrostab.physics.registry import effects
 from gyrostab.units import HOUR
-
-Array = NDArray[Any]
 
 
 def effect_candidates(

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.cross_spectrum import correlation_score
 from gyrostab.diagnose.statistics.mean import slow_coefficients
 from gyrostab.diagnose.statistics.scores import (
-    Array,
     Windows,
     cube_root_score,
     moving_sum,
@@ -27,7 +26,7 @@ from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.units import HOUR
 
 #: Indices of the first and of the second axis of each pair.
-Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]
+Pairs = tuple[Ints, Ints]
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (60,)
 #: Blocks over which the increments are averaged.
@@ -108,8 +107,8 @@ class CommonMode(Statistic):
 
 
 def _whiten_means(
-    residual: Array, available: NDArray[np.bool_], blocks: xr.Dataset, baseline: xr.Dataset
-) -> Array:
+    residual: Floats, available: Bools, blocks: xr.Dataset, baseline: xr.Dataset
+) -> Floats:
     """Whiten block means by (record), axis, block; zero where missing."""
     white = baseline["mean_variance"].values
     begin = blocks["begin"].values
@@ -139,11 +138,11 @@ def _whiten_means(
 
 
 def _shared_increments(
-    present: NDArray[np.bool_],
+    present: Bools,
     pairs: Pairs,
     blocks: xr.Dataset,
     baseline: xr.Dataset,
-) -> tuple[Array, Array]:
+) -> tuple[Floats, Floats]:
     """Return increments of one white noise (probe, axis, block), and the share of each pair."""
     series = np.random.default_rng(_PROBE_SEED).standard_normal((_PROBE_COUNT, 1, present.shape[1]))
     series = series * np.sqrt(np.nan_to_num(baseline["mean_variance"].values))
@@ -158,17 +157,17 @@ def _shared_increments(
 
 
 def _correlate_pairs(
-    increments: Array,
-    present: NDArray[np.bool_],
+    increments: Floats,
+    present: Bools,
     pairs: Pairs,
     windows: Windows,
     span: int,
-    shared: tuple[Array, Array] | None,
-) -> tuple[Array, Array]:
+    shared: tuple[Floats, Floats] | None,
+) -> tuple[Floats, Floats]:
     """Correlate pairs by (record), pair, window, averaged over `span` blocks; count averages."""
     first, second = pairs
 
-    def products(values: Array) -> Array:
+    def products(values: Floats) -> Floats:
         product = values[..., first, :] * values[..., second, :]
         return np.asarray(sum_over_windows(product, windows, axis=-1))
 
@@ -185,7 +184,7 @@ def _correlate_pairs(
     return np.where(count >= _MIN_AVERAGES, r, np.nan), count / np.maximum(memory, 1.0)
 
 
-def _blocks_per_value(averages: Array, pairs: Pairs) -> Array:
+def _blocks_per_value(averages: Floats, pairs: Pairs) -> Floats:
     """Return the blocks per independent value of each pair (Bartlett 1935).
 
     It is the sum of the products of their autocorrelations.
@@ -199,7 +198,7 @@ def _blocks_per_value(averages: Array, pairs: Pairs) -> Array:
     return np.asarray(2.0 * (first * second).sum(axis=-1) - 1.0)
 
 
-def _score_all_axes(r: Array, count: Array, pairs: Pairs, axes: int) -> Array:
+def _score_all_axes(r: Floats, count: Floats, pairs: Pairs, axes: int) -> Floats:
     """Score all correlations by (record), window, span, jointly (Bartlett 1954)."""
     matrix = np.broadcast_to(np.eye(axes), (*r.shape[:-3], *r.shape[-2:], axes, axes)).copy()
     matrix[(..., *pairs)] = matrix[(..., *pairs[::-1])] = np.moveaxis(r, -3, -1)

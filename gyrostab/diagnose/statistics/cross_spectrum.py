@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Complexes, Floats, Ints
 from gyrostab.diagnose.evidence.held_out import LinearModel
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
@@ -36,7 +36,6 @@ from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.power import with_axis
 from gyrostab.diagnose.statistics.scores import (
-    Array,
     Windows,
     cube_root_score,
     statistic_dataset,
@@ -45,8 +44,6 @@ from gyrostab.diagnose.statistics.scores import (
 )
 from gyrostab.diagnose.statistics.shared_factors import estimate_shared_factors
 from gyrostab.diagnose.statistics.wording import subject, taus_text
-
-Complex = NDArray[np.complex128]
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (5, 15, 45)
@@ -207,10 +204,10 @@ class CrossSpectrum(Statistic):
 def _pair_coherency(
     blocks: xr.Dataset,
     baseline: xr.Dataset,
-    left: NDArray[np.int64],
-    right: NDArray[np.int64],
+    left: Ints,
+    right: Ints,
     windows: Windows,
-) -> tuple[Complex, Array]:
+) -> tuple[Complexes, Floats]:
     """Compute the coherency and the number of complex frequencies by (record), pair, window, band.
 
     The last band is that of all bands together. If both axes are noisy in only a few blocks, these
@@ -228,7 +225,7 @@ def _pair_coherency(
     present = np.isfinite(cross) & np.isfinite(left_power) & np.isfinite(right_power) & (weight > 0)
     weight = np.where(present, weight, 0.0)
 
-    def summed(values: Complex) -> Complex:
+    def summed(values: Complexes) -> Complexes:
         sums = sum_over_windows(np.where(present, values, 0.0) * weight, windows)
         return np.concatenate([sums, sums.sum(axis=-1, keepdims=True)], axis=-1)
 
@@ -240,7 +237,7 @@ def _pair_coherency(
     return np.where(count >= _MIN_FREQUENCIES, sums, complex(np.nan, np.nan)), count
 
 
-def correlation_score(r: Array, samples: Array) -> Array:
+def correlation_score(r: Floats, samples: Floats) -> Floats:
     """Return the normal score of a correlation of independent samples of known mean (Wallace 1959).
 
     Examples
@@ -253,15 +250,13 @@ def correlation_score(r: Array, samples: Array) -> Array:
     return np.asarray(np.sign(r) * size * (8.0 * freedom + 1.0) / (8.0 * freedom + 3.0))
 
 
-def _is_white(density: NDArray[np.complex128]) -> bool:
+def _is_white(density: Complexes) -> bool:
     """Return whether a density is the same in all bands, up to `_MAX_WHITE_RANGE`."""
     size = np.abs(density)
     return bool(np.ptp(size, axis=-1).max() <= _MAX_WHITE_RANGE * size.max(initial=0.0))
 
 
-def draw_coherency(
-    shape: Array, size: tuple[int, ...], rng: np.random.Generator
-) -> NDArray[np.complex128]:
+def draw_coherency(shape: Floats, size: tuple[int, ...], rng: np.random.Generator) -> Complexes:
     """Draw the sample coherency of independent signals, from `shape` complex frequencies."""
     freedom = np.maximum(np.where(np.isfinite(shape), shape, 1.0) - 1.0, 0.0)
     with np.errstate(divide="ignore", over="ignore"):
@@ -277,7 +272,7 @@ def _covariance_variants(bands: int) -> tuple[Variant, ...]:
     return (*(_any_phase([band]) for band in single_bands), _any_phase(groups))
 
 
-def _any_phase(rows: list[Array]) -> Variant:
+def _any_phase(rows: list[Floats]) -> Variant:
     """Return cross-densities of any phase in these bands."""
     columns = np.array([factor * row for row in rows for factor in (1.0 + 0j, 1j)])
     return Variant({}, numbered_columns(len(columns)), columns[:, None, None, :])

@@ -9,11 +9,11 @@ import numpy as np
 import xarray as xr
 from scipy.special import log_ndtr
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
 from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
-    Array,
     Windows,
     cube_root_score,
     cumulative,
@@ -103,7 +103,7 @@ class DriftingLine(Statistic):
         )
 
 
-def _expected_spectrum(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
+def _expected_spectrum(blocks: xr.Dataset, baseline: xr.Dataset) -> Floats:
     """Return the spectrum of the baseline at the lines by axis, part, line."""
     parts, block_count = blocks.sizes["part"], blocks.sizes["block"]
     part_of_block = np.arange(block_count) * parts // block_count
@@ -117,7 +117,7 @@ def _expected_spectrum(blocks: xr.Dataset, baseline: xr.Dataset) -> Array:
     )
 
 
-def _score_cells(power: Array, weight: Array, expected: Array) -> Array:
+def _score_cells(power: Floats, weight: Floats, expected: Floats) -> Floats:
     """Score every line of every part relative to its surroundings and its mean over the parts.
 
     Many lines are averaged in groups.
@@ -142,7 +142,7 @@ def _path_shapes(lines: int) -> Iterator[tuple[int, float]]:
         move += max(1, move // _SPECTRUM_SECTIONS)
 
 
-def _largest_path_sums(cells: Array, edges: Array) -> tuple[Array, Array]:
+def _largest_path_sums(cells: Floats, edges: Floats) -> tuple[Floats, Floats]:
     """Find the largest sum along paths between sections by (record), row, column; count paths.
 
     `cells` are (record), row, part, line [standard deviations], `edges` (2, part) the begin and end
@@ -175,7 +175,7 @@ def _largest_path_sums(cells: Array, edges: Array) -> tuple[Array, Array]:
     return largest, path_count
 
 
-def _path_columns(frequency: Array) -> dict[str, Any]:
+def _path_columns(frequency: Floats) -> dict[str, Any]:
     """Return columns from the middle of one section to another, and averaging times between."""
     edges = np.linspace(frequency[0], frequency[-1], _SPECTRUM_SECTIONS + 1)
     middle = (edges[1:] + edges[:-1]) / 2.0

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
@@ -15,7 +15,6 @@ from gyrostab.diagnose.predict.sizes import component_mixture, mean_mixture
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.base import Competitor
 
-Array = NDArray[np.float64]
 _JUMP = "bias_jump"
 _TRANSITION_BLOCKS = (4, 8)  # lengths of the gradual changes that a jump is compared with
 EVENT_LENGTHS = 48  # that are tried, from two blocks up
@@ -108,7 +107,7 @@ def restart_competitors(component: Component, state: State) -> Iterator[Competit
     yield Competitor("a gradual change", gradual - steps, allowed)
 
 
-def _sum_evidence(jumps: Sequence[Component], state: State, courses: Sequence[Array]) -> float:
+def _sum_evidence(jumps: Sequence[Component], state: State, courses: Sequence[Floats]) -> float:
     """Return the log evidence of other courses (block,), one for each jump, of free size."""
     return sum(
         component_mixture(jump, state, _with_course(jump, course)).evidence
@@ -116,14 +115,14 @@ def _sum_evidence(jumps: Sequence[Component], state: State, courses: Sequence[Ar
     )
 
 
-def _with_course(jump: Component, *courses: Array) -> Variant:
+def _with_course(jump: Component, *courses: Floats) -> Variant:
     """Return the variant of a jump with courses (block,) instead of the step."""
     shape = jump.variant.design[:1].shape
     design = np.concatenate([np.broadcast_to(course, shape) for course in courses])
     return replace(jump.variant, design=design)
 
 
-def _event_course(state: State, span: tuple[int, int]) -> Array:
+def _event_course(state: State, span: tuple[int, int]) -> Floats:
     block = np.arange(state.blocks.sizes["block"])
     return ((block >= span[0]) & (block < span[1])).astype(np.float64)
 
@@ -145,7 +144,7 @@ def _evidence_in_scatter(component: Component, state: State) -> float:
     return float(np.logaddexp.reduce(with_jump) - np.logaddexp.reduce(without) - np.log(wide) - 0.5)
 
 
-def _possible_variances(component: Component, state: State) -> list[Array]:
+def _possible_variances(component: Component, state: State) -> list[Floats]:
     """Return white variances of the means: the usual, and larger ones for a time near the jump."""
     axis, block_count = component.row[0], state.blocks.sizes["block"]
     block = np.arange(block_count)

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.evidence.held_out import mean_factors, mean_residual, noise_weight
 from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.evidence.products import axis_noise
@@ -36,7 +36,6 @@ from gyrostab.diagnose.statistics.jump_forms import (
     scatter_competitors,
 )
 from gyrostab.diagnose.statistics.scores import (
-    Array,
     Windows,
     statistic_dataset,
     sum_over_windows,
@@ -62,11 +61,11 @@ LENGTHS = (1, 5, 15, 45)
 class MeanNoise(NamedTuple):
     """Covariance of the block means of one axis, as the filters need it."""
 
-    present: Array
-    innovation: Array
-    gain: Array
-    decay: Array
-    remaining: Array
+    present: Floats
+    innovation: Floats
+    gain: Floats
+    decay: Floats
+    remaining: Floats
 
 
 class BlockMeanStatistic(Statistic):
@@ -179,7 +178,7 @@ class Mean(BlockMeanStatistic):
         """Let a step at a given time occur at every restart."""
         return replace(candidate, variants=_with_steps_at_restarts(candidate.variants, windows))
 
-    def row_factors(self, group: Sequence[Candidate], row: int, trial: Trial) -> Array:
+    def row_factors(self, group: Sequence[Candidate], row: int, trial: Trial) -> Floats:
         axis = trial.state.axes[row]
         designs = [
             np.stack(mean_columns(variant, row), axis=-1)
@@ -211,7 +210,7 @@ class Mean(BlockMeanStatistic):
         )
 
 
-def mean_inputs(trial: Trial, axis: str) -> list[Array | None]:
+def mean_inputs(trial: Trial, axis: str) -> list[Floats | None]:
     """Return all that the evidence of means of an axis is computed from, but for the designs."""
     baseline = trial.state.baseline
     noise = axis_noise(baseline, axis)
@@ -260,7 +259,9 @@ def _with_steps_at_restarts(
     return (*halved, every)
 
 
-def window_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, Array]:
+def window_means(
+    blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
+) -> tuple[Floats, Floats]:
     """Compute matched filter and information of every window; their ratio is the constant in it.
 
     By (record), axis, window [degree-1 hour], and by axis, window [degree-2 hour2]; NaN if too
@@ -276,7 +277,7 @@ def window_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> 
     return amount, information
 
 
-def _matched_filter(residual: Array, noise: MeanNoise, windows: Windows) -> tuple[Array, Array]:
+def _matched_filter(residual: Floats, noise: MeanNoise, windows: Windows) -> tuple[Floats, Floats]:
     """Return filter output and information of each window, both independent of a constant."""
     weighted = apply_precision(residual, noise)
     weighted_ones = apply_precision(np.ones(residual.shape[-1]), noise)
@@ -298,7 +299,7 @@ def slow_coefficients(baseline: xr.Dataset, axis: int) -> tuple[float, float]:
     return float(np.nan_to_num(B)), float(np.nan_to_num(K))
 
 
-def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, series: Array) -> MeanNoise:
+def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, series: Floats) -> MeanNoise:
     """Return the covariance of the means (..., block) of an axis, with all known processes."""
     b, k = slow_coefficients(baseline, axis)
     begin, end = blocks["begin"].values, blocks["end"].values
@@ -324,14 +325,14 @@ def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, series: Arra
     return MeanNoise(present.astype(float), innovation, gain, decay, remaining)
 
 
-def apply_precision(series: Array, noise: MeanNoise) -> Array:
+def apply_precision(series: Floats, noise: MeanNoise) -> Floats:
     """Multiply each series (..., block) by the inverse covariance; zero at missing blocks."""
     rows = np.ascontiguousarray(series.reshape(-1, series.shape[-1]), dtype=np.float64)
     out = precision_times(rows, noise.innovation, noise.gain, noise.decay)
     return np.asarray(out.reshape(series.shape))
 
 
-def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Array) -> float:
+def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Floats) -> float:
     """Return the constant added only in some blocks of a recording [degree hour-1].
 
     By generalised least squares with a constant of the record.
@@ -344,7 +345,7 @@ def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Arr
     return float(solved[1])
 
 
-def _moving_blocks(state: State, row: int, columns: list[Array]) -> NDArray[np.bool_]:
+def _moving_blocks(state: State, row: int, columns: list[Floats]) -> Bools:
     """Return the blocks in which the effect moves enough to show in the power of the axis."""
     blocks = state.blocks
     y = blocks["mean"].values[row] - state.baseline["known_mean"].values[row]

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.diagnose.evidence.held_out import LinearModel, noise_columns, with_independent_cells
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
 from gyrostab.diagnose.predict.candidates import (
@@ -39,7 +39,6 @@ from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, choose_columns
 from gyrostab.diagnose.statistics.scores import (
-    Array,
     cube_root_score,
     statistic_dataset,
 )
@@ -107,7 +106,7 @@ class Power(Statistic):
         """
         frequency = case.blocks["frequency"].values
         rate = float(case.blocks.attrs["sampling_rate_hz"])
-        level: dict[str, Array] = {}
+        level: dict[str, Floats] = {}
         for (symbol, name), share in case.prediction.level.items():
             square = (
                 case.coefficient.sel(term=symbol).values ** 2
@@ -202,8 +201,8 @@ class Power(Statistic):
 
 
 def _filter_change(
-    response: Array, coefficient: xr.DataArray, frequency: Array, rate: float
-) -> Array:
+    response: Floats, coefficient: xr.DataArray, frequency: Floats, rate: float
+) -> Floats:
     """Return the change of the baseline spectrum by a response."""
     total = np.zeros((coefficient.sizes["axis"], 1, frequency.size))
     size, terms = coefficient.values, list(coefficient["term"].values)
@@ -214,17 +213,17 @@ def _filter_change(
     return total * (response - 1.0)
 
 
-def with_axis(density: Array) -> Array:
+def with_axis(density: Floats) -> Floats:
     """Return a density with the axis first."""
     return np.asarray(density if np.ndim(density) == 3 else np.asarray(density)[None])
 
 
-def _changes_over_time(density: Array) -> bool:
+def _changes_over_time(density: Floats) -> bool:
     rows = with_axis(density)
     return bool(np.abs(rows - rows[:, :1]).max(initial=0.0) > 1e-6 * np.abs(rows).max(initial=0.0))
 
 
-def _is_white_and_constant(density: Array) -> bool:
+def _is_white_and_constant(density: Floats) -> bool:
     """Return whether a density is white and constant: a change of N, which is free."""
     rows = with_axis(density)
     return bool((np.ptp(rows, axis=(1, 2)) <= 1e-6 * np.abs(rows).max(axis=(1, 2))).all())
@@ -254,7 +253,7 @@ def parts_of_record(component: Component, state: State) -> Iterator[Competitor]:
     yield Competitor("an effect in a part of the record", nats, allowed)
 
 
-def _fit_part(component: Component, state: State, inside: NDArray[np.int64]) -> tuple[float, float]:
+def _fit_part(component: Component, state: State, inside: Ints) -> tuple[float, float]:
     """Fit the first column to some blocks only; return its size and error."""
     outside = np.ones(state.masked.shape[1], np.bool_)
     outside[inside] = False
@@ -287,7 +286,7 @@ def separate_filters(components: Sequence[Component], state: State) -> Iterator[
     yield Competitor("a filter on each axis", nats, allowed)
 
 
-def burst_intervals(block_count: int) -> NDArray[np.int64]:
+def burst_intervals(block_count: int) -> Ints:
     """List intervals of blocks, (interval, 2) as first and stop: 1, 2, 4, ... up to half of all.
 
     Each starts half its length after the one before. If there are too many of a length, only the

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.evidence.held_out import LinearModel
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
 from gyrostab.diagnose.predict.condition import free_shape
@@ -24,7 +24,6 @@ from gyrostab.diagnose.statistics.base import NullDraw, Statistic, choose_column
 from gyrostab.diagnose.statistics.rotation_order import score_orders, turns_per_second
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
-    Array,
     Windows,
     cube_root_score,
     statistic_dataset,
@@ -50,7 +49,7 @@ class RampPhase(Statistic):
     is_power_weighted = True
     is_phase_locked = True
 
-    def null(self, draw: NullDraw) -> Mapping[str, Array]:
+    def null(self, draw: NullDraw) -> Mapping[str, Floats]:
         if "profile" not in draw.blocks:
             return {}
         samples = draw.blocks["profile_samples"].values.astype(np.float64)
@@ -69,7 +68,7 @@ class RampPhase(Statistic):
         """
         windows = window_set(blocks.sizes["block"], LENGTHS)
         rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
-        scored: list[tuple[Array, ...]] = []
+        scored: list[tuple[Floats, ...]] = []
         kinds: list[str] = []
         tau_min, tau_max = [], []
         if "order" in blocks:
@@ -134,8 +133,8 @@ class RampPhase(Statistic):
         return free_shape(state, component.row[0])
 
     def noise_shares(
-        self, component: Component, axis: str, state: State, weight: Array
-    ) -> tuple[Array | float, list[Array], list[Array]]:
+        self, component: Component, axis: str, state: State, weight: Floats
+    ) -> tuple[Floats | float, list[Floats], list[Floats]]:
         """Return the power of the aliased lines of the profile."""
         blocks = state.blocks
         mean, _ = component_mixture(component, replace(state, weight=weight)).moments()
@@ -165,7 +164,9 @@ class RampPhase(Statistic):
         return f"{component} at {multiple}the rotation rate of the tool {when}"
 
 
-def _score_profile(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
+def _score_profile(
+    blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
+) -> tuple[Floats, ...]:
     """Return score, ratio and rms of the mean by phase, by (record), axis, window, 1."""
     profile = blocks["profile"].values
     samples = blocks["profile_samples"].values
@@ -183,7 +184,7 @@ def _score_profile(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -
     return cube_root_score(ratio, np.where(used > 1, used / 2.0, np.nan)), ratio, np.sqrt(excess)
 
 
-def _ramp_lines(state: State) -> NDArray[np.bool_]:
+def _ramp_lines(state: State) -> Bools:
     """Return the lines at multiples of the ramp frequency, aliased by the sampling."""
     lines = state.blocks["line_frequency"].values
     rate = float(state.blocks.attrs["sampling_rate_hz"])

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.diagnose.baseline.axis_means import MAX_SCATTER
 from gyrostab.diagnose.baseline.posterior import visible_coefficients
 from gyrostab.diagnose.evidence.folds import fold_blocks
@@ -31,7 +31,6 @@ from gyrostab.diagnose.statistics.base import SizeFit, Sizes
 from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, mean_inputs
 from gyrostab.units import HOUR
 
-Array = NDArray[Any]
 #: Sizes of a walk that are tried, and those that its size is estimated from: decades above the walk
 #: that the means just show, of the first, and between two. Design choice: half decades, and 12 %.
 _WALK_DECADES = (0.0, 0.5)

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.mean import MeanNoise, apply_precision, mean_noise
-from gyrostab.diagnose.statistics.scores import Array, Windows, statistic_dataset
+from gyrostab.diagnose.statistics.scores import Windows, statistic_dataset
 from gyrostab.diagnose.statistics.wording import axes_text
 
 _DECAY_BLOCKS = (2, 6, 18)  # in which a transient falls to 1/e; design choice
@@ -77,7 +78,7 @@ def _restart_blocks(blocks: xr.Dataset) -> np.ndarray:
     return np.unique(first_blocks[(first_blocks > 0) & (first_blocks < blocks.sizes["block"])])
 
 
-def _restart_designs(restarts: np.ndarray, block_count: int) -> tuple[Array, Windows]:
+def _restart_designs(restarts: np.ndarray, block_count: int) -> tuple[Floats, Windows]:
     """Return the designs of all transients and jumps, and their windows."""
     age = np.full(block_count, np.inf)
     for start in restarts:
@@ -95,7 +96,7 @@ def _restart_designs(restarts: np.ndarray, block_count: int) -> tuple[Array, Win
     return np.array(rows), Windows(np.array(first, dtype=np.int64), np.array(stop, dtype=np.int64))
 
 
-def _matched_filter(residual: Array, designs: Array, noise: MeanNoise) -> tuple[Array, Array]:
+def _matched_filter(residual: Floats, designs: Floats, noise: MeanNoise) -> tuple[Floats, Floats]:
     """Return filter output and information of each design, both independent of a constant."""
     weighted = apply_precision(designs, noise)
     weighted_ones = apply_precision(np.ones((1, designs.shape[-1])), noise)[0]

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Bools
 from gyrostab.diagnose.evidence.held_out import LinearModel
 from gyrostab.diagnose.evidence.spectral_lines import interpolate_bands
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
@@ -28,8 +27,6 @@ from gyrostab.diagnose.statistics.scores import Windows, exponential_score, sum_
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Windows as EffectWindows
-
-Array = NDArray[Any]
 
 EARTH_RATE = 15.041067  # deg/h: 360 degrees in a sidereal day of 23.934470 h
 
@@ -251,7 +248,7 @@ def fit_amplitude(component: Component, state: State) -> tuple[float, float, flo
     return float(math.hypot(mean[0], mean[1])), sd, math.degrees(math.atan2(mean[1], mean[0]))
 
 
-def _visible_bands(density: Array, axis: str, state: State) -> NDArray[np.bool_]:
+def _visible_bands(density: Array, axis: str, state: State) -> Bools:
     """Find the bands in which an added density (block, band) is visible in the record."""
     row = state.axes.index(axis)
     shape = np.nan_to_num(state.blocks["shape"].values[row])
@@ -259,7 +256,7 @@ def _visible_bands(density: Array, axis: str, state: State) -> NDArray[np.bool_]
     return np.asarray((shape * ratio**2).sum(axis=0) >= state.settings.visible_sigma**2)
 
 
-def _visible_lines(line_power: Array, axis: str, state: State) -> NDArray[np.bool_]:
+def _visible_lines(line_power: Array, axis: str, state: State) -> Bools:
     """Find the lines at which an added density (line,) is visible in the record."""
     row, blocks = state.axes.index(axis), state.blocks
     bands, lines = blocks["frequency"].values, blocks["line_frequency"].values

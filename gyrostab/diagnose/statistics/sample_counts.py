@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from gyrostab.arrays import Array, Bools, Floats, Ints
 from gyrostab.diagnose.evidence.folds import fold_subsets
 from gyrostab.diagnose.evidence.sample_counts import (
     CountEvidence,
@@ -42,7 +41,6 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.base import NullDraw, Region, SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.sample_sizes import estimate_from_counts
 from gyrostab.diagnose.statistics.scores import (
-    Array,
     statistic_dataset,
     sum_over_windows,
     window_set,
@@ -94,7 +92,7 @@ class SampleCounts(Statistic):
         """Return a distribution with heavy tails."""
         return [Candidate("~outliers", self, (), (Variant({}, ("kurtosis",), np.empty(0)),))]
 
-    def null(self, draw: NullDraw) -> Mapping[str, NDArray[Any]]:
+    def null(self, draw: NullDraw) -> Mapping[str, Array]:
         return _draw_null_counts(draw.blocks, draw.sample_sd, draw.record_count, draw.rng)
 
     def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
@@ -210,7 +208,7 @@ class SampleCounts(Statistic):
         return f"{subject(region)} {verb} {samples} {when}"
 
 
-def _kurtosis_score(excess: Array, samples: Array) -> tuple[Array, Array]:
+def _kurtosis_score(excess: Floats, samples: Floats) -> tuple[Floats, Floats]:
     """Return the normal score of the excess kurtosis of Gaussian samples, and 1 where known.
 
     Anscombe and Glynn (1983), doi:10.1093/biomet/70.1.227.
@@ -237,9 +235,9 @@ def _count_evidence(
     name: str,
     data: xr.Dataset,
     state: State,
-    subsets: NDArray[np.bool_],
+    subsets: Bools,
     count_evidence: CountEvidence,
-) -> Array:
+) -> Floats:
     """Return the evidence of a raised count, (record, axis)."""
     records = data.sizes.get("record", 1)
     if name == "lattice":
@@ -269,7 +267,7 @@ def _is_everywhere(component: Component) -> bool:
 
 def find_anomalous_blocks(
     component: Component, blocks: xr.Dataset, settings: Settings = DEFAULTS
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Return the blocks left out for anomalous samples; none if all are alike.
 
     None either if fewer than the least quiescent share of the blocks would be left.
@@ -308,8 +306,8 @@ def mask_anomalous_blocks(
 
 
 def _draw_null_counts(
-    blocks: xr.Dataset, sd: Array, count: int, rng: np.random.Generator
-) -> dict[str, NDArray[np.int64]]:
+    blocks: xr.Dataset, sd: Floats, count: int, rng: np.random.Generator
+) -> dict[str, Ints]:
     """Draw outliers, repeats, extremes and zeros of Gaussian noise on the quantization grid.
 
     Repeats and zeros (record, axis, block) follow from the scatter of each block, and from the
@@ -346,7 +344,7 @@ def _draw_null_counts(
     }
 
 
-def _neighbour_statistics(blocks: xr.Dataset, sd: Array) -> tuple[Array, Array]:
+def _neighbour_statistics(blocks: xr.Dataset, sd: Floats) -> tuple[Floats, Floats]:
     """Measure the scatter of the samples of each block, and the correlation of neighbours.
 
     Both (axis, block) are interpolated over blocks with losses or outliers. The standard deviations
@@ -380,11 +378,11 @@ def _neighbour_statistics(blocks: xr.Dataset, sd: Array) -> tuple[Array, Array]:
 
 def _filled_zeros(
     blocks: xr.Dataset,
-    zeros: NDArray[np.int64],
-    samples: NDArray[np.int64],
-    zero_again: Array,
+    zeros: Ints,
+    samples: Ints,
+    zero_again: Floats,
     rng: np.random.Generator,
-) -> NDArray[np.int64]:
+) -> Ints:
     """Return the zeros (record, axis, block) that look filled because they coincide by chance.
 
     On a single axis these are zeros next to another one, whose probability is `zero_again`.
@@ -407,8 +405,8 @@ def _filled_zeros(
 
 
 def _grid_chance(
-    mean: Array, step: float, scatter: Array, correlation: Array, truncated: bool
-) -> tuple[Array, Array, Array]:
+    mean: Floats, step: float, scatter: Floats, correlation: Floats, truncated: bool
+) -> tuple[Floats, Floats, Floats]:
     """Return the probabilities, by block, of correlated normal noise on a grid.
 
     They are those of zero, of zero again after a zero, and of a repeat at another value. The values
@@ -444,8 +442,8 @@ def _grid_chance(
 
 
 def _chance_in_bin(
-    middle: Array, half: float, scatter: Array, correlation: Array
-) -> tuple[Array, Array]:
+    middle: Floats, half: float, scatter: Floats, correlation: Floats
+) -> tuple[Floats, Floats]:
     """Return the probabilities that a sample, and a pair of neighbours, are in a bin.
 
     The middle of the bin is relative to the mean of the samples; `half` is half of its width.
@@ -463,7 +461,7 @@ def _chance_in_bin(
     return np.asarray(chance), np.asarray(pair_density.sum(axis=1))
 
 
-def _before_truncation(mean: Array, step: float, scatter: Array) -> Array:
+def _before_truncation(mean: Floats, step: float, scatter: Floats) -> Floats:
     """Return means before truncation, which shifts them by up to half a step towards zero."""
     out = mean
     for _ in range(_TRUNCATION_ROUNDS):
@@ -472,8 +470,8 @@ def _before_truncation(mean: Array, step: float, scatter: Array) -> Array:
 
 
 def _draw_extremes(
-    blocks: xr.Dataset, sd: Array, samples: NDArray[np.int64], count: int, rng: np.random.Generator
-) -> NDArray[np.int64]:
+    blocks: xr.Dataset, sd: Floats, samples: Ints, count: int, rng: np.random.Generator
+) -> Ints:
     """Draw the blocks of the smallest and largest value; each is repeated on a coarse grid."""
     out = np.zeros((count, *samples.shape), np.int64)
     for axis, step in enumerate(blocks["quantization_step"].values):

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import gammaincinv, ndtr, ndtri
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.reduce.outliers import outlier_limit
 from gyrostab.diagnose.reduce.schema import axis_values, weighted_mean
@@ -18,7 +18,6 @@ from gyrostab.diagnose.settings import INTERVAL_TAILS, Settings
 from gyrostab.noise import NORMAL_95
 from gyrostab.units import HOUR
 
-Array = NDArray[np.float64]
 #: Standard deviation of the difference of white noise and the median of its eight neighbours, in
 #: standard deviations of the noise.
 MEDIAN_DEPARTURE_SIGMA = 1.08
@@ -89,7 +88,7 @@ def estimate_from_counts(
     return {}
 
 
-def _zone_width(stuck: float, samples: Array, away: Array, variance: float) -> float:
+def _zone_width(stuck: float, samples: Floats, away: Floats, variance: float) -> float:
     """Return the half-width of a zone at which this share of the samples sticks.
 
     Outside the zone, the rate is reduced by its width. `samples` are those of each block, `away`

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.special import ndtri_exp
 
-Array = NDArray[np.float64]
+from gyrostab.arrays import Floats, Ints
+
 #: tau * f at the maximum of sin(pi f tau)^4 / (pi f tau)^2, the Allan variance of a sine.
 SINE_TAU_CYCLES = 0.371
 _WINDOW_STEP = 0.2  # of the length of a window, from one to the next; design choice
@@ -21,11 +21,11 @@ _LONG_WINDOW_STEP = 0.4  # the same for longer records
 class Windows(NamedTuple):
     """Windows of whole blocks: first block of each, and the first one after it."""
 
-    first: NDArray[np.int64]
-    stop: NDArray[np.int64]
+    first: Ints
+    stop: Ints
 
     @property
-    def length(self) -> NDArray[np.int64]:
+    def length(self) -> Ints:
         """Number of blocks of each window."""
         return self.stop - self.first
 
@@ -79,7 +79,7 @@ def cumulative(values: Any, axis: int = -1) -> Any:
     return total
 
 
-def moving_sum(values: Array, span: int) -> Array:
+def moving_sum(values: Floats, span: int) -> Floats:
     """Return sums over `span` places of the last dimension around each, fewer at the ends."""
     ends = [(0, 0)] * (values.ndim - 1) + [(span // 2, span - 1 - span // 2)]
     total = cumulative(np.pad(values, ends))
@@ -98,7 +98,7 @@ def sum_over_windows(values: Any, windows: Windows, *, axis: int = -2) -> Any:
     return np.take(total, windows.stop, axis) - np.take(total, windows.first, axis)
 
 
-def cube_root_score(ratio: Array, shape: Array) -> Array:
+def cube_root_score(ratio: Floats, shape: Floats) -> Floats:
     """Return the near-normal score of a gamma-distributed ratio of mean 1; NaN for shape <= 0.
 
     Wilson and Hilferty (1931), doi:10.1073/pnas.17.12.684.
@@ -113,7 +113,7 @@ def cube_root_score(ratio: Array, shape: Array) -> Array:
         return np.asarray((np.cbrt(np.maximum(ratio, 0.0)) - (1.0 - variance)) / np.sqrt(variance))
 
 
-def exponential_score(value: Array) -> Array:
+def exponential_score(value: Floats) -> Floats:
     """Return the normal score of an exponentially distributed value of mean 1.
 
     Examples
@@ -129,10 +129,10 @@ def statistic_dataset(
     *,
     windows: Windows,
     columns: dict[str, Any],
-    z: Array,
-    ratio: Array,
+    z: Floats,
+    ratio: Floats,
     rows: Sequence[str] | None = None,
-    estimate: Array | None = None,
+    estimate: Floats | None = None,
     one_sided: bool = False,
 ) -> xr.Dataset:
     """Assemble the results of a statistic by (record), row, window, tau.

@@ -11,8 +11,8 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State, cross_column, pair_rows
 from gyrostab.diagnose.predict.sizes import component_mixture
@@ -21,7 +21,6 @@ from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
 
-Array = NDArray[np.float64]
 DRAWS = 1000  # of the posterior: 25 beyond each end of a 95 % interval
 FACTOR_ROUNDS = 50  # of the iteration for a matrix of rank 1
 # Grid of low-passes: bandwidths as parts of the sampling rate, their number, and interpolation.
@@ -69,9 +68,7 @@ def estimate_shared_factors(
     return sizes
 
 
-def _summarise_draws(
-    draws: Array, is_likelier: NDArray[np.bool_]
-) -> tuple[float, float, float, float]:
+def _summarise_draws(draws: Floats, is_likelier: Bools) -> tuple[float, float, float, float]:
     """Return the median of the likelier draws, and spread and ends of the 95 % interval of all."""
     low, high = np.quantile(draws, INTERVAL_TAILS)
     return (
@@ -84,7 +81,7 @@ def _summarise_draws(
 
 def _weight_bandwidths(
     component: Component, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], state: State
-) -> tuple[Array, Array, Array, Array, Array]:
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Weight the bandwidths by their likelihood, interpolated between those of the grid.
 
     White noise has the same prior probability as all low-passes together. Returned are bandwidths
@@ -121,7 +118,7 @@ def _score_bandwidth(
     rows: Sequence[tuple[str, ...]],
     axes: tuple[str, ...],
     state: State,
-) -> Array:
+) -> Floats:
     """Return log likelihood, products of the pairs, their errors, and limits for one bandwidth."""
     variant = component.variant
     if "bandwidth" in variant.values:
@@ -157,7 +154,7 @@ def _max_factor(axis: str, variant: Variant, state: State) -> float:
     )
 
 
-def _draw_pair_factors(product: Array, limit: Array, rng: np.random.Generator) -> Array:
+def _draw_pair_factors(product: Floats, limit: Floats, rng: np.random.Generator) -> Floats:
     """Draw the factors of two axes (draw, axis), uniform in the logarithm over their range."""
     size = np.minimum(np.abs(product), limit.prod(axis=1))
     low, high = size / limit[:, 1], limit[:, 0]
@@ -166,8 +163,8 @@ def _draw_pair_factors(product: Array, limit: Array, rng: np.random.Generator) -
 
 
 def _solve_factors(
-    product: Array, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], limit: Array
-) -> Array:
+    product: Floats, rows: Sequence[tuple[str, ...]], axes: tuple[str, ...], limit: Floats
+) -> Floats:
     """Return the factors (draw, axis) whose products are nearest to those of the pairs.
 
     Their sign makes the largest of them positive.

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.evidence.spectral_lines import (
     expected_lines,
     line_evidence,
@@ -38,7 +38,6 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.base import Region, SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
-    Array,
     Windows,
     cube_root_score,
     cumulative,
@@ -153,8 +152,8 @@ class SpectralLine(Statistic):
         return state.with_columns("line", "all", [skirt])
 
     def noise_shares(
-        self, component: Component, axis: str, state: State, weight: Array
-    ) -> tuple[Array | float, list[Array], list[Array]]:
+        self, component: Component, axis: str, state: State, weight: Floats
+    ) -> tuple[Floats | float, list[Floats], list[Floats]]:
         """Return the power of the line and its skirt above the spectrum around them.
 
         The power of the bands of a resonance is free: its slopes are not known.
@@ -245,7 +244,7 @@ class SpectralLine(Statistic):
         )
 
 
-def explained_lines(state: State) -> NDArray[np.bool_]:
+def explained_lines(state: State) -> Bools:
     """Return the lines (axis, line) that the effects in the model explain."""
     nothing = np.zeros(state.blocks.sizes["line"], np.bool_)
     of_all = state.given.get(("line", "all"), [])
@@ -257,7 +256,7 @@ def explained_lines(state: State) -> NDArray[np.bool_]:
     )
 
 
-def _equal_block_share(blocks: xr.Dataset, windows: Windows) -> Array:
+def _equal_block_share(blocks: xr.Dataset, windows: Windows) -> Floats:
     """Return the equivalent share of equal-power blocks in a mean, by window and line."""
     power, shape = (blocks[name].values for name in ("power", "shape"))
     present = np.isfinite(power) & (shape > 0)
@@ -275,7 +274,7 @@ def _equal_block_share(blocks: xr.Dataset, windows: Windows) -> Array:
     return np.asarray(even[..., place - 1] * (1.0 - share) + even[..., place] * share)
 
 
-def _mean_around(flat: Array) -> Array:
+def _mean_around(flat: Floats) -> Floats:
     """Return the mean of the lines around each, without its leakage; one-sided near the ends."""
     n = flat.shape[-1]
     total = cumulative(flat)

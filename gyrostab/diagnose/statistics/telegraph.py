@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 import xarray as xr
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.fast_switching import (
     SwitchingEvidence,
     switching_evidence,
@@ -36,7 +37,6 @@ from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.base import Competitor, SizeFit, Sizes
 from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, mean_inputs
-from gyrostab.diagnose.statistics.scores import Array
 
 _LEVELS = "~levels"  # nuisance alternative: an arbitrary course
 _MAX_NULL_BLOCKS = 20_000  # of null records that are searched for two levels; limits time
@@ -183,7 +183,7 @@ class Telegraph(BlockMeanStatistic):
 
 def _search_axis(
     data: xr.Dataset, state: State, axis: str
-) -> tuple[Array, TelegraphCourses, SwitchingEvidence | None, bool]:
+) -> tuple[Floats, TelegraphCourses, SwitchingEvidence | None, bool]:
     """Search an axis for two levels in block means, and then within blocks.
 
     The switching within blocks is None unless it is better; the last result is whether it refutes
@@ -262,12 +262,12 @@ def _unequal_nats(component: Component, state: State) -> float:
     return min(nats)
 
 
-def _course_of(variant: Variant) -> Array:
+def _course_of(variant: Variant) -> Floats:
     """Return the share on the upper level of each block, or of its sub-blocks if it is known."""
     return variant.inside if variant.inside.size else np.asarray(variant.design[0, 0])
 
 
-def _compare_visits(share: Array, axis: str, data: xr.Dataset, state: State) -> Visits:
+def _compare_visits(share: Floats, axis: str, data: xr.Dataset, state: State) -> Visits:
     return compare_visits(
         axis_values(data, "mean", axis),
         state.baseline,
@@ -294,7 +294,7 @@ def _is_resolved(switching: SwitchingEvidence, state: State) -> bool:
 
 def search_block_means(
     state: State, axis: str, data: xr.Dataset | None = None
-) -> tuple[Array, TelegraphCourses]:
+) -> tuple[Floats, TelegraphCourses]:
     """Return evidence and courses of two levels in block means, by default those of the state."""
     return telegraph_evidence(
         state.blocks if data is None else data,

@@ -5,12 +5,11 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.diagnose.evidence.held_out import LinearModel
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
 from gyrostab.diagnose.predict.condition import free_covariance
@@ -32,8 +31,6 @@ from gyrostab.diagnose.statistics.cross_spectrum import draw_coherency
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Windows
 from gyrostab.physics.registry import effects
-
-Array = NDArray[Any]
 
 
 class Transfer(Statistic):

@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.power import LEVEL_COLUMNS
 from gyrostab.diagnose.statistics.scores import (
-    Array,
     Windows,
     cube_root_score,
     statistic_dataset,
@@ -151,7 +150,7 @@ def scale_to_expected(
     return blocks.assign(power=(("axis", "block", "band"), power, blocks["power"].attrs))
 
 
-def scatter_moments(count: Array, total: Array, inverse: Array) -> tuple[Array, Array]:
+def scatter_moments(count: Floats, total: Floats, inverse: Floats) -> tuple[Floats, Floats]:
     """Return mean and variance of the scatter of gamma-distributed levels relative to their mean.
 
     Exact for levels of one scale: their mean is then independent of their ratios (Lukacs 1955), so
@@ -173,7 +172,7 @@ def scatter_moments(count: Array, total: Array, inverse: Array) -> tuple[Array, 
         ) - mean**2
 
 
-def _band_groups(bands: int) -> list[NDArray[np.int64]]:
+def _band_groups(bands: int) -> list[Ints]:
     """Return the bands of each column: one, a quarter of them, all."""
     return [
         *(np.array([band]) for band in range(bands)),
@@ -186,9 +185,9 @@ def _band_groups(bands: int) -> list[NDArray[np.int64]]:
 def _relative_levels(
     blocks: xr.Dataset,
     baseline: xr.Dataset,
-    used: NDArray[np.bool_],
-    members: list[NDArray[np.int64]],
-) -> tuple[list[tuple[Array, Array]], list[str]]:
+    used: Bools,
+    members: list[Ints],
+) -> tuple[list[tuple[Floats, Floats]], list[str]]:
     """Return the level over that of the record, with its shape, and the axes of each row.
 
     By (record), row, block, group of bands: one pair for all axes, whose shapes all records have in
@@ -220,7 +219,7 @@ def _relative_levels(
 
 
 @np.errstate(divide="ignore", invalid="ignore")
-def _limit_noisy_blocks(ratio: Array, shape: Array) -> Array:
+def _limit_noisy_blocks(ratio: Floats, shape: Floats) -> Floats:
     """Return the factor (record), axis, block, 1 that limits a noisy block, equal in all bands."""
     weight = shape.sum(axis=-1, keepdims=True)
     level = (ratio * shape).sum(axis=-1, keepdims=True) / weight
@@ -229,8 +228,8 @@ def _limit_noisy_blocks(ratio: Array, shape: Array) -> Array:
 
 
 def _coherence_factor(
-    blocks: xr.Dataset, used: NDArray[np.bool_], members: list[NDArray[np.int64]], weight: Array
-) -> Array:
+    blocks: xr.Dataset, used: Bools, members: list[Ints], weight: Floats
+) -> Floats:
     """Return the variance factor (record), 1, 1, group of the mean over coherent axes."""
     first, second = pair_indices(blocks)
     power = np.nan_to_num(blocks["power"].values[..., used])
@@ -247,7 +246,7 @@ def _coherence_factor(
 
 
 @np.errstate(divide="ignore", invalid="ignore")
-def _robust_mean(level: Array, weight: Array) -> Array:
+def _robust_mean(level: Floats, weight: Floats) -> Floats:
     """Return the mean of each series of levels, from its median, robust against noisy blocks."""
     present = weight > 0
     usual = np.where(present, weight, 0.0).sum(axis=-2, keepdims=True) / np.maximum(
@@ -259,7 +258,7 @@ def _robust_mean(level: Array, weight: Array) -> Array:
     )
 
 
-def _median_over_blocks(values: Array) -> Array:
+def _median_over_blocks(values: Floats) -> Floats:
     """Return the median over the second last dimension, ignoring NaN."""
     ordered = np.sort(values, axis=-2)
     count = np.isfinite(ordered).sum(axis=-2, keepdims=True)
@@ -272,8 +271,8 @@ def _median_over_blocks(values: Array) -> Array:
 
 @np.errstate(divide="ignore", invalid="ignore")
 def _score_scatter(
-    level: Array, weight: Array, windows: Windows, span: int, *, single: int
-) -> tuple[Array, Array, Array]:
+    level: Floats, weight: Floats, windows: Windows, span: int, *, single: int
+) -> tuple[Floats, Floats, Floats]:
     """Return score, ratio and variation by (record), row, window, column, for `span` blocks.
 
     The single bands come first.

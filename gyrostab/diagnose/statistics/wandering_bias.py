@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.diagnose.baseline.correlated_bias import (
     CorrelatedBias,
     find_correlated_bias,
@@ -40,7 +40,6 @@ from gyrostab.diagnose.statistics.power import Power, parts_of_record
 from gyrostab.diagnose.statistics.random_process import RandomProcess
 from gyrostab.noise import NORMAL_95
 
-Array = NDArray[Any]
 Result = TypeVar("Result")
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.errors import OutputError
 from gyrostab.store.lazy import RowSource, concatenate_columns
 
@@ -37,7 +38,7 @@ class Spool:
     def _opened_file(self) -> Any:
         return tempfile.TemporaryFile(prefix="gyrostab-", buffering=0)
 
-    def store(self, values: NDArray[Any]) -> SpooledPiece:
+    def store(self, values: Array) -> SpooledPiece:
         """Append a column of 8-byte values to the file."""
         plain = np.ascontiguousarray(values)
         try:
@@ -56,7 +57,7 @@ class Spool:
             ) from error
         return SpooledPiece(self, begin, plain.shape, plain.dtype)
 
-    def read_into(self, begin: int, out: NDArray[Any]) -> None:
+    def read_into(self, begin: int, out: Array) -> None:
         """Read the bytes of a contiguous array from an offset on; threads take turns."""
         view = out.view(np.uint8).data
         with self._lock:
@@ -75,7 +76,7 @@ class SpooledPiece(RowSource):
         self.spool, self.begin = spool, begin  # the byte at which the values begin
         self.shape, self.dtype = shape, dtype
 
-    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+    def read_into(self, row: int, begin: int, out: Array) -> None:
         """Read the values from `begin` on into `out`."""
         line = out if out.flags.c_contiguous else np.empty_like(out)
         self.spool.read_into(self.begin + 8 * begin, line)
@@ -91,13 +92,13 @@ class EvenPiece(RowSource):
     def __init__(self, first: int, step: int, size: int):
         self.first, self.step, self.shape = first, step, (size,)
 
-    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+    def read_into(self, row: int, begin: int, out: Array) -> None:
         """Read the values from `begin` on into `out`."""
         out.view(np.int64)[:] = self.first + self.step * np.arange(begin, begin + out.size)
 
 
 #: Consecutive rows of a column.
-Piece = NDArray[Any] | SpooledPiece | EvenPiece
+Piece = Array | SpooledPiece | EvenPiece
 
 
 def find_even(stamps: NDArray[np.datetime64]) -> NDArray[np.datetime64] | EvenPiece:
@@ -141,7 +142,7 @@ class Buffers:
         self._spool: Spool | None = None
         self._held = 0  # bytes in memory
 
-    def add(self, block: Mapping[Any, NDArray[Any] | EvenPiece]) -> None:
+    def add(self, block: Mapping[Any, Array | EvenPiece]) -> None:
         """Append one block, in which all columns have the same length."""
         for key, values in block.items():
             self._pieces[key].append(
@@ -156,7 +157,7 @@ class Buffers:
                     for piece in column
                 ]
 
-    def _as_piece(self, key: Any, values: NDArray[Any]) -> NDArray[Any] | SpooledPiece:
+    def _as_piece(self, key: Any, values: Array) -> Array | SpooledPiece:
         plain = np.ascontiguousarray(values, dtype=self.dtypes[key])
         if self._spool is not None:
             return self._spool.store(plain)

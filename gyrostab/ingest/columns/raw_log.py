@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Buffers, find_even
 from gyrostab.ingest.columns.plan import Column, Plan
@@ -38,7 +39,7 @@ _COMMON_CODES = (-999.25, -9999.0)
 Locate = Callable[[Sequence[int]], list[str]]
 #: Row number within a block -> the cell that cannot be read, or the row, as it is written.
 Quote = Callable[[int], str]
-Values = dict[int, NDArray[np.float64]]
+Values = dict[int, Floats]
 
 _NO_ROWS = np.empty(0, np.int64)
 
@@ -48,13 +49,13 @@ class ConvertedBlock(NamedTuple):
 
     rows: int
     values: Values  # in the inner unit, by column number
-    stamps: NDArray[np.int64] | None
+    stamps: Ints | None
     #: Column number -> number of missing values, range of the others in the unit of the file, and
     #: whether these are whole numbers.
     ranges: dict[int, tuple[int, float, float, bool]]
     #: Unreadable rows, and other rows with an unreadable gyro cell.
-    bad_rows: NDArray[np.int64]
-    cell_rows: NDArray[np.int64]
+    bad_rows: Ints
+    cell_rows: Ints
     #: Unreadable cells, and unreadable gyro cells of `cell_rows`.
     bad_cells: int
     cells: int
@@ -89,9 +90,7 @@ class RawLogBuilder:
             column.source: (0.0, 0.0) for column in [*self.gyro, *self.channels]
         }
 
-    def prepare(
-        self, values: Values, stamps: NDArray[np.int64] | None, *, words: int = 0
-    ) -> ConvertedBlock:
+    def prepare(self, values: Values, stamps: Ints | None, *, words: int = 0) -> ConvertedBlock:
         """Convert one block in place; thread-safe.
 
         `values` are in the unit of the file by column number, NaN where unreadable or empty;
@@ -280,9 +279,7 @@ class RawLogBuilder:
         return dataset
 
 
-def clean_column(
-    values: NDArray[np.float64], factor: float, offset: float
-) -> tuple[int, float, float, bool]:
+def clean_column(values: Floats, factor: float, offset: float) -> tuple[int, float, float, bool]:
     """Convert in place, ``values * factor + offset``, and set infinite values to NaN.
 
     Return the number of values that are not finite, the range of the others before conversion, and
@@ -312,8 +309,8 @@ def summary_of(
     form: str,
     rows: int | None,
     *,
-    head: Sequence[int] | NDArray[np.int64] = (),
-    tail: Sequence[int] | NDArray[np.int64] = (),
+    head: Sequence[int] | Ints = (),
+    tail: Sequence[int] | Ints = (),
     notes: Sequence[str] = (),
 ) -> FileSummary:
     """Summarise a file without reading all of its data.
@@ -346,7 +343,7 @@ class _Places:
     def __init__(self) -> None:
         self.total, self.names, self.first = 0, list[str](), ""
 
-    def add(self, rows: NDArray[np.int64], locate: Locate, quote: Quote | None = None) -> None:
+    def add(self, rows: Ints, locate: Locate, quote: Quote | None = None) -> None:
         if quote is not None and rows.size and not self.total:
             self.first = f"{quote(int(rows[0])):.100}"
         self.total += len(rows)
@@ -398,11 +395,11 @@ def describe_codes(
     return notes
 
 
-def _read_window(values: Any, begin: int) -> NDArray[np.float64]:
+def _read_window(values: Any, begin: int) -> Floats:
     return np.asarray(read_slice(values, begin, begin + _CODE_ROWS), dtype=np.float64)
 
 
-def _is_far(value: float, readings: NDArray[np.float64]) -> bool:
+def _is_far(value: float, readings: Floats) -> bool:
     """Return whether a value is far outside others, in terms of their range."""
     low, high = readings.min(initial=np.inf), readings.max(initial=-np.inf)
     return bool(max(low - value, value - high) > _MIN_CODE_DISTANCE * (high - low))
@@ -412,7 +409,7 @@ def _is_common(value: float, common: Sequence[float]) -> bool:
     return bool(np.isclose(value, common, rtol=1e-9).any())
 
 
-def _find_code(values: NDArray[np.float64], common: Sequence[float]) -> float | None:
+def _find_code(values: Floats, common: Sequence[float]) -> float | None:
     """Return the lowest or highest value if it repeats far outside all others; zero is a reading.
 
     A value that is one of the `common` codes may be the only one, or the others may be few: a slow

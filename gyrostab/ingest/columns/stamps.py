@@ -18,6 +18,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Ints
 from gyrostab.errors import UnitError
 from gyrostab.ingest.columns.dates import YEAR_FIRST, as_iso
 from gyrostab.store.lazy import read_slice
@@ -159,13 +160,13 @@ def _epoch_ns(text: str, since: str, calendar: str | None) -> int:
     return int(days) * 86400 * 10**9 + nanoseconds
 
 
-def read_stamps(raw: xr.Dataset, begin: int, end: int) -> NDArray[np.int64]:
+def read_stamps(raw: xr.Dataset, begin: int, end: int) -> Ints:
     """Read the stamps of rows of a raw log [ns since 1970], `NAT` where unreadable."""
     stamps = read_slice(raw["time"].data, max(begin, 0), min(end, raw.sizes["row"]))
     return to_nanoseconds(stamps)
 
 
-def texts_to_ns(texts: Sequence[Any] | NDArray[Any]) -> NDArray[np.int64]:
+def texts_to_ns(texts: Sequence[Any] | Array) -> Ints:
     """Convert ISO 8601 texts (UTC by default) to stamps; unreadable ones become `NAT`."""
     stamps = pd.to_datetime(
         pd.Series(list(texts), dtype=object), format="ISO8601", utc=True, errors="coerce"
@@ -173,7 +174,7 @@ def texts_to_ns(texts: Sequence[Any] | NDArray[Any]) -> NDArray[np.int64]:
     return to_nanoseconds(stamps.dt.tz_convert(None).to_numpy(), far_as_nat=True)
 
 
-def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDArray[np.int64]:
+def integers_to_ns(values: Ints, unit: TimeUnit, epoch: int) -> Ints:
     """Convert counts of `unit` since `epoch` to stamps; `NAT` outside 1678 to 2262."""
     zero = epoch if unit.epoch is None else unit.epoch
     up, down = unit.ns.numerator, unit.ns.denominator
@@ -192,9 +193,7 @@ def integers_to_ns(values: NDArray[np.int64], unit: TimeUnit, epoch: int) -> NDA
     return np.where(inside & (values >= low) & (values <= high), stamps, NAT)
 
 
-def floats_to_ns(
-    values: NDArray[np.floating[Any]], unit: TimeUnit, epoch: int
-) -> NDArray[np.int64]:
+def floats_to_ns(values: NDArray[np.floating[Any]], unit: TimeUnit, epoch: int) -> Ints:
     """Convert floats to stamps: whole units as integers, only the fraction in floating point."""
     wide = np.asarray(values, dtype=np.float64)
     usable = np.isfinite(wide) & (np.abs(wide) < 2.0**62)
@@ -204,7 +203,7 @@ def floats_to_ns(
     return np.where(usable & (stamps != NAT), stamps + part, NAT)
 
 
-def numbers_to_ns(values: NDArray[Any], unit: TimeUnit, epoch: int) -> NDArray[np.int64]:
+def numbers_to_ns(values: Array, unit: TimeUnit, epoch: int) -> Ints:
     """Convert counts of `unit` since `epoch`, whole or not, to stamps."""
     if values.dtype.kind == "f":
         return floats_to_ns(values, unit, epoch)
@@ -226,7 +225,7 @@ def plain_number(text: str) -> str:
 
 def cells_to_ns(
     cells: Sequence[str], unit: TimeUnit | None, epoch: int, order: str = YEAR_FIRST
-) -> NDArray[np.int64]:
+) -> Ints:
     """Convert text cells to stamps, exact to the last decimal: numbers of `unit`, or dates.
 
     `order` is that of day, month and year in dates that are not ISO 8601, and `epoch` the beginning
@@ -254,7 +253,7 @@ class TurningClock:
         self.last: int | None = None
         self.turns: list[int] = []
 
-    def continue_stamps(self, stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+    def continue_stamps(self, stamps: Ints) -> Ints:
         """Return the stamps of the next block, continued where the clock begins again."""
         places = np.flatnonzero(stamps != NAT)
         if not places.size:
@@ -291,7 +290,7 @@ class TurningClock:
         ]
 
 
-def typical_step(stamps: NDArray[np.int64]) -> float:
+def typical_step(stamps: Ints) -> float:
     """Return a typical step [ns] of the first stamps of a block; 0 if all of them are equal."""
     steps = np.diff(stamps[stamps != NAT][: _TYPICAL_STEPS + 1])
     return float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0

@@ -7,8 +7,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.ingest.columns.dates import is_iso
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
@@ -27,7 +27,7 @@ Batch = TypeVar("Batch")
 Fetch = Callable[[int, int, int], Any]
 
 
-def _to_floats(values: Any) -> tuple[NDArray[np.float64], int]:
+def _to_floats(values: Any) -> tuple[Floats, int]:
     """Convert values to float64, NaN where missing, and count the cells that are not numbers."""
     if np.ma.isMaskedArray(values):
         mask = np.ma.getmaskarray(values)
@@ -49,7 +49,7 @@ def _to_floats(values: Any) -> tuple[NDArray[np.float64], int]:
     return out, words
 
 
-def to_stamps(values: Any, column: Column) -> NDArray[np.int64]:
+def to_stamps(values: Any, column: Column) -> Ints:
     """Convert a column of dates, numbers or text to stamps [ns since 1970]."""
     mask = np.ma.getmaskarray(values) if np.ma.isMaskedArray(values) else None
     array = np.ma.getdata(values) if mask is not None else np.asarray(values)

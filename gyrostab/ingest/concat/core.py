@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.errors import TimeError, UnitError
 from gyrostab.ingest.concat.grid import PlacedLog, Source, group_axes, merge_gaps, source_of
 from gyrostab.ingest.concat.lazy import PlacedArray, chunk_of, place_on_grid
@@ -343,7 +343,7 @@ def unify_units(logs: Sequence[tuple[str, xr.Dataset]], name: str, advice: str) 
     return unified
 
 
-def _scale_values(values: NDArray[Any], factor: float, offset: float) -> NDArray[np.float64]:
+def _scale_values(values: Array, factor: float, offset: float) -> Floats:
     return np.asarray(values * factor + offset, dtype=np.float64)
 
 
@@ -359,16 +359,14 @@ def _on_time(piece: PlacedLog, name: str, start: int, rate: float) -> PlacedArra
     return channel.data, None, np.stack([samples, inside[places], np.ones_like(places)], axis=1)
 
 
-def _channel_stamps(piece: PlacedLog, name: str, start: int, rate: float) -> NDArray[np.int64]:
+def _channel_stamps(piece: PlacedLog, name: str, start: int, rate: float) -> Ints:
     """Return the stamps of a channel [ns since 1970], shifted with its log after a clock step."""
     stamps = to_nanoseconds(piece.source.log.variables[f"time_{name}"].values)
     moved = int(grid_times(start, rate, piece.first)) - piece.source.start
     return np.asarray(stamps + moved if abs(moved) > 1e9 / rate else stamps)
 
 
-def _own_time(
-    holders: Sequence[PlacedLog], name: str, start: int, rate: float
-) -> tuple[NDArray[np.int64], Any]:
+def _own_time(holders: Sequence[PlacedLog], name: str, start: int, rate: float) -> tuple[Ints, Any]:
     """Return stamps and values in order of time; duplicates are taken from the earlier log."""
     tolerance = int(_SAME_STAMP_PERIODS * 1e9 / rate)
     arrays = [piece.source.log.variables[name].data for piece in holders]

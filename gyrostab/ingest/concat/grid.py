@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.gap_table import (
     DUPLICATE,
@@ -55,7 +55,7 @@ class PlacedLog:
     source: Source
     #: (n, 3): first sample of the grid, first sample of the log, length; more than one where the
     #: log's rate differs from the grid's.
-    runs: NDArray[np.int64]
+    runs: Ints
     off: float  # offset of its samples from those of the grid [samples]
     #: A stamp of its clock [ns since 1970] and the corresponding sample of the grid.
     clock: tuple[int, int]
@@ -72,7 +72,7 @@ class PlacedLog:
         """Sample of the grid after its last one."""
         return int(self.runs[-1, 0] + self.runs[-1, 2])
 
-    def on_grid(self, samples: Any) -> NDArray[np.int64]:
+    def on_grid(self, samples: Any) -> Ints:
         """Return the grid samples of log samples, extrapolated beyond the ends of the log."""
         samples = np.asarray(samples, dtype=np.int64)
         which = np.clip(
@@ -81,7 +81,7 @@ class PlacedLog:
         return np.asarray(self.runs[which, 0] + samples - self.runs[which, 1])
 
 
-def read_log_slice(source: Source, begin: int, end: int) -> NDArray[np.float64]:
+def read_log_slice(source: Source, begin: int, end: int) -> Floats:
     """Read the signal of some samples (axis, sample); NaN beyond the ends of a log."""
     data = source.log.variables[signal_name(source.log)].data
     values = np.full((data.shape[0], end - begin), np.nan)
@@ -107,7 +107,7 @@ def log_span(log: xr.Dataset) -> tuple[int, int]:
     return source.start, source.end
 
 
-def runs_of(first: int, off: float, size: int, ratio: float) -> NDArray[np.int64]:
+def runs_of(first: int, off: float, size: int, ratio: float) -> Ints:
     """Return the runs of a log whose sample n lies at grid sample ``first + off + n * ratio``.
 
     A log that is faster than the grid (ratio < 1) drops a sample now and then; a slower one leaves
@@ -139,7 +139,7 @@ def runs_of(first: int, off: float, size: int, ratio: float) -> NDArray[np.int64
     return np.stack([first + begin + shift(begin), begin, end - begin], axis=1)
 
 
-Table = NDArray[np.int64]
+Table = Ints
 
 _EMPTY: Table = np.empty((0, 5), dtype=np.int64)
 _MAX_SAMPLE = np.iinfo(np.int64).max // 2

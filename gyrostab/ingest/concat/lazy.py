@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.store.lazy import RowSource, find_source, make_dask, read_into
 
 #: An array (time), or (axis, time) with the row to read, and its runs: first sample of the grid,
 #: first of the array, length.
-PlacedArray = tuple[Any, int | None, NDArray[np.int64]]
+PlacedArray = tuple[Any, int | None, Ints]
 #: One run, as above.
 Run = tuple[int, int, int]
 
@@ -33,7 +33,7 @@ def chunk_of(arrays: Sequence[Any]) -> int:
     return int(np.clip(lengths.most_common(1)[0][0], _MIN_CHUNK_SAMPLES, _MAX_CHUNK_SAMPLES))
 
 
-def place_in_memory(array: NDArray[Any], runs: NDArray[np.int64], size: int) -> NDArray[np.float64]:
+def place_in_memory(array: Array, runs: Ints, size: int) -> Floats:
     """Place the runs of one array (..., sample) on a grid in memory, NaN where it has no sample."""
     out = np.full((*array.shape[:-1], size), np.nan)
     length = runs[:, 2]
@@ -45,12 +45,12 @@ def place_in_memory(array: NDArray[Any], runs: NDArray[np.int64], size: int) -> 
 
 def place_array(
     array: Any,
-    runs: NDArray[np.int64],
+    runs: Ints,
     size: int,
     chunk: int,
     *,
     most_in_memory: int,
-    convert: Callable[[NDArray[np.float64]], None] | None = None,
+    convert: Callable[[Floats], None] | None = None,
 ) -> Any:
     """Place one array (..., sample) on a grid: up to so many numbers in memory, else lazily.
 
@@ -75,7 +75,7 @@ class GridSource(RowSource):
         self,
         rows: Sequence[Sequence[PlacedArray]],
         shape: tuple[int, ...],
-        convert: Callable[[NDArray[np.float64]], None] | None,
+        convert: Callable[[Floats], None] | None,
     ):
         # the sources alone: dask arrays around them are slow to look into and to send
         self.rows = [
@@ -85,7 +85,7 @@ class GridSource(RowSource):
         self.shape, self.convert = shape, convert
         self.parts = [array for parts in self.rows for array, _, _ in parts]
 
-    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+    def read_into(self, row: int, begin: int, out: Array) -> None:
         """Read samples of one row from `begin` on into `out`; the first that is not NaN counts."""
         end, done = begin + out.size, 0
         parts = [(array, own, clip_runs(runs, begin, end)) for array, own, runs in self.rows[row]]
@@ -114,7 +114,7 @@ def place_on_grid(
     chunk: int,
     *,
     flat: bool = False,
-    convert: Callable[[NDArray[np.float64]], None] | None = None,
+    convert: Callable[[Floats], None] | None = None,
 ) -> Any:
     """Place arrays on one grid, float64, NaN where no array has a sample.
 
@@ -141,7 +141,7 @@ def _group_runs(array: Any, runs: Sequence[Run]) -> Iterator[Sequence[Run]]:
         begin = stop
 
 
-def clip_runs(runs: NDArray[np.int64], begin: int, end: int) -> list[Run]:
+def clip_runs(runs: Ints, begin: int, end: int) -> list[Run]:
     """Return the parts of runs in a range of the grid, by their offset after `begin`."""
     low = np.searchsorted(runs[:, 0] + runs[:, 2], begin, side="right")
     high = np.searchsorted(runs[:, 0], end, side="left")

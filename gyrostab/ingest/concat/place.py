@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.ingest.concat.grid import PlacedLog, Source, read_log_slice, runs_of
 from gyrostab.ingest.gap_table import (
     CLOCK_STEP,
@@ -220,7 +220,7 @@ class Match:
         return self.common >= 2 and self.same >= _MIN_ALIKE_SHARE * self.common
 
 
-def count_alike(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[Any, Any]:
+def count_alike(held: Floats, new: Floats) -> tuple[Any, Any]:
     """Count samples known in both arrays (axis, ..., sample), and those equal but for rounding."""
     is_known = np.isfinite(held) & np.isfinite(new)
     has_values = is_known.any(axis=0)
@@ -234,7 +234,7 @@ def count_alike(held: NDArray[np.float64], new: NDArray[np.float64]) -> tuple[An
     return has_values.sum(axis=-1), same.sum(axis=-1)
 
 
-def match_ends(ends: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> Match:
+def match_ends(ends: Iterable[tuple[Floats, Floats]]) -> Match:
     """Compare two files at the ends of their overlap.
 
     `ends` yields the samples (axis, sample) of both files at each end; if those of the earlier file
@@ -253,7 +253,7 @@ def match_ends(ends: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]]) 
     )
 
 
-def _find_shift(held: NDArray[np.float64], new: NDArray[np.float64]) -> Match:
+def _find_shift(held: Floats, new: Floats) -> Match:
     """Compare `new` with `held` at the displacement at which they are alike, or without one."""
     size, margin = new.shape[1], (held.shape[1] - new.shape[1]) // 2
     unshifted = Match(*count_alike(held[:, margin : margin + size], new))

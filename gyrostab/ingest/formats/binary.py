@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Ints
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.formats.layout import (
     Field,
@@ -137,7 +137,7 @@ def _count_time(
 def _read_field(
     path: Path,
     layout: Layout,
-    starts: NDArray[np.int64] | None,
+    starts: Ints | None,
     field: Field,
     begin: int,
     stop: int,

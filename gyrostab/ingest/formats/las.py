@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Ints
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.dates import as_iso, find_order
 from gyrostab.ingest.columns.headers import is_time_unit
@@ -61,7 +62,7 @@ def _read_curves(path: Path, options: ReadOptions) -> TablesOfFile:
 
 def _find_clock(
     path: Path, curves: list[Any], options: ReadOptions
-) -> tuple[list[Any], NDArray[Any] | None]:
+) -> tuple[list[Any], Array | None]:
     """Return the curves of dates and times with their stamps; none where a number counts time."""
     by_name = {curve.mnemonic.upper(): curve for curve in curves}
     time_curves = [by_name[name] for name in ("TIME", "DATETIME") if name in by_name]
@@ -115,7 +116,7 @@ def _to_stamps(
     return np.asarray(start.view("datetime64[ns]") + since)
 
 
-def _parse_days(days: list[str], unit: str) -> NDArray[np.int64] | None:
+def _parse_days(days: list[str], unit: str) -> Ints | None:
     """Return the beginnings of days [ns since 1970], by the unit of the curve or by their form."""
     if re.search(r"(?i)yy", unit):
         code = re.sub(

@@ -33,6 +33,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Ints
 from gyrostab.errors import OptionError
 from gyrostab.store.toml import load_toml_folder, parse_toml, read_toml_text
 
@@ -184,7 +185,7 @@ def _parse_field(item: Any, order: str, offset: int) -> Field | None:
 
 
 @cache
-def _crc_table() -> NDArray[Any]:
+def _crc_table() -> Array:
     remainders = np.arange(256, dtype=np.uint32) << 24
     for _ in range(8):
         remainders = remainders << 1 ^ (remainders >> 31) * _POLYNOMIAL
@@ -206,7 +207,7 @@ def crc32_mpeg2(rows: NDArray[np.uint8]) -> NDArray[np.uint32]:
     return checksums
 
 
-def find_messages(raw: NDArray[np.uint8], sync: bytes, size: int) -> NDArray[np.int64]:
+def find_messages(raw: NDArray[np.uint8], sync: bytes, size: int) -> Ints:
     """Return the first byte of each message that is complete and whose checksum is right.
 
     `raw` is the stream, such as a memory map of a file; a message begins with `sync` and has `size`
@@ -224,7 +225,7 @@ def find_messages(raw: NDArray[np.uint8], sync: bytes, size: int) -> NDArray[np.
     return np.concatenate(message_starts)
 
 
-def unwrap_counter(counter: NDArray[Any], modulus: int) -> NDArray[np.int64]:
+def unwrap_counter(counter: Array, modulus: int) -> Ints:
     """Return the sum of the steps of a counter that restarts from 0 after `modulus` - 1.
 
     A loss of a whole turn of the counter is not visible.

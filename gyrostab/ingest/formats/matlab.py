@@ -26,8 +26,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
@@ -67,7 +67,7 @@ _TYPES = {
 _STRUCT, _OBJECT, _OPAQUE, _NUMERIC, _CLASSES = 2, 3, 17, range(6, 16), range(1, 18)
 _DAMAGE = (KeyError, ValueError, OverflowError, RecursionError, struct.error, zlib.error)
 
-Arrays = Iterator[tuple[str, NDArray[Any]]]
+Arrays = Iterator[tuple[str, Array]]
 
 
 def matches(path: Path) -> bool:
@@ -233,9 +233,7 @@ def _read_tables(path: Path, objects: list[str]) -> Iterator[tuple[int, TableCol
             yield from _make_column(f"{name}.{variable}", table[variable].to_numpy(), unit)
 
 
-def _make_column(
-    header: str, values: NDArray[Any], unit: str = ""
-) -> Iterator[tuple[int, TableColumn]]:
+def _make_column(header: str, values: Array, unit: str = "") -> Iterator[tuple[int, TableColumn]]:
     """Yield length and column of numbers; dates and durations become nanoseconds."""
     if values.dtype.kind == "M":
         values, unit = to_nanoseconds(values, far_as_nat=True), "nanoseconds since 1970-01-01"
@@ -315,7 +313,7 @@ class _Elements:
     def _take_text(self) -> str:
         return bytes(self._take_element()[1]).decode("latin-1")
 
-    def _take_array(self) -> NDArray[Any]:
+    def _take_array(self) -> Array:
         kind, data = self._take_element()
         return np.frombuffer(data, self.order + _TYPES[kind])
 
@@ -356,7 +354,7 @@ class _Elements:
             raise ValueError("the names of the fields of a structure are damaged")
         parts = (names[at : at + length] for at in range(0, len(names), length))
         fields = [part.split(b"\0")[0].decode("latin-1") for part in parts]
-        columns: dict[str, list[list[NDArray[Any]]]] = {field: [] for field in fields}
+        columns: dict[str, list[list[Array]]] = {field: [] for field in fields}
         for _ in range(count):
             for field in fields:
                 kind, data = self._take_element()

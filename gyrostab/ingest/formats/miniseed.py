@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Floats
 from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
@@ -43,10 +44,10 @@ class _Trace:
     starts: list[int] = field(default_factory=list)
     ends: list[int] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
-    values: list[NDArray[Any]] = field(default_factory=list)
+    values: list[Array] = field(default_factory=list)
 
     @property
-    def delays(self) -> NDArray[np.float64]:
+    def delays(self) -> Floats:
         """Period less the nominal one of each segment [ns], 0 if they agree to the resolution."""
         last = np.array(self.sizes) - 1
         late = np.array(self.ends) - self.starts - grid_times(0, self.rate, last)
@@ -140,7 +141,7 @@ def _in_step(first: _Trace, second: _Trace) -> bool:
     return bool((np.abs(starts) <= apart).all() and (np.abs(starts + ends) <= apart).all())
 
 
-def _join_values(pieces: list[NDArray[Any]], rows: int) -> NDArray[Any]:
+def _join_values(pieces: list[Array], rows: int) -> Array:
     """Join the segments of a trace, with NaN up to the number of rows; empty if not loaded."""
     missing = rows - sum(map(len, pieces)) if pieces else 0
     padding = [np.full(missing, np.nan)] if missing or not pieces else []

@@ -14,8 +14,8 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Bools, Floats
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.stamps import TimeUnit
@@ -105,13 +105,13 @@ class Packing:
             else np.ma.array(counts, mask=invalid)
         )
 
-    def read_values(self, stored: Any) -> NDArray[np.float64]:
+    def read_values(self, stored: Any) -> Floats:
         """Return unpacked values, NaN where missing."""
         counts = self.read_counts(stored)
-        values: NDArray[np.float64] = np.ma.filled(counts.astype(np.float64), np.nan)
+        values: Floats = np.ma.filled(counts.astype(np.float64), np.nan)
         return values if self.is_plain else values * self.scale + self.offset
 
-    def _find_invalid(self, counts: NDArray[Any]) -> NDArray[np.bool_] | None:
+    def _find_invalid(self, counts: Array) -> Bools | None:
         masks = [counts == value for value in self.missing]
         if np.isfinite(self.low):
             masks.append(counts < self.low)
@@ -129,7 +129,7 @@ def attribute_text(value: Any) -> str | None:
 
 def _attribute_numbers(
     where: str, key: str, value: Any, stored: np.dtype[Any], *, wraps: bool
-) -> NDArray[Any]:
+) -> Array:
     """Return the numbers of an attribute; with `wraps`, signed ones become unsigned."""
     array = np.atleast_1d(np.asarray(value)).ravel()
     if array.dtype.kind not in "iuf" or not array.size:
@@ -158,7 +158,7 @@ def _representable_values(missing: Iterable[Any], stored: np.dtype[Any]) -> Iter
 
 def _valid_range(
     where: str,
-    numbers: Mapping[str, NDArray[Any]],
+    numbers: Mapping[str, Array],
     stored: np.dtype[Any],
     scale: float,
     offset: float,

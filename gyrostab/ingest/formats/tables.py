@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.errors import FormatError, OptionError, UnitError
 from gyrostab.ingest.columns.headers import FileColumn
 from gyrostab.ingest.columns.plan import Column, Plan, describe_left_out
@@ -67,7 +67,7 @@ class StoredArray:
 
     def __init__(self, values: Any, along: int):
         self.values, self.along = values, along
-        self._held: tuple[tuple[int, int], NDArray[Any]] = (-1, -1), np.empty((0, 0))
+        self._held: tuple[tuple[int, int], Array] = (-1, -1), np.empty((0, 0))
 
     def make_columns(
         self, names: Sequence[str], attributes: Mapping[str, Any]
@@ -81,7 +81,7 @@ class StoredArray:
             for place, name in enumerate(names)
         ]
 
-    def _read_rows(self, place: int, start: int, stop: int) -> NDArray[Any]:
+    def _read_rows(self, place: int, start: int, stop: int) -> Array:
         rows = slice(start, stop)
         if len(self.values.shape) == 1:
             return self._read_box(rows)
@@ -92,7 +92,7 @@ class StoredArray:
             held = self._held = (start, stop), self._read_box(box)
         return np.asarray(held[1].take(place, axis=1 - self.along))
 
-    def _read_box(self, box: Any) -> NDArray[Any]:
+    def _read_box(self, box: Any) -> Array:
         with nullcontext() if isinstance(self.values, xr.Variable) else library_lock():
             return np.asarray(self.values[box])
 

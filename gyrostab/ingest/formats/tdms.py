@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import NAT
 from gyrostab.ingest.formats.recognise import make_matcher
@@ -125,9 +125,9 @@ def _make_table(path: Path, channels: list[Any]) -> Table:
 
 
 def _waveform_stamps(step: float, start: Any) -> Callable[[int, int], Any]:
-    def part(begin: int, stop: int) -> NDArray[Any]:
+    def part(begin: int, stop: int) -> Array:
         since = np.rint(np.arange(begin, stop) * (step * 1e9)).astype(np.int64)
-        stamps: NDArray[Any] = start + (
+        stamps: Array = start + (
             since.view("timedelta64[ns]") if isinstance(start, np.datetime64) else since
         )
         return stamps

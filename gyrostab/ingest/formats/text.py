@@ -18,8 +18,8 @@ from typing import IO, cast
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Ints
 from gyrostab.errors import FormatError, UnitError
 from gyrostab.ingest.columns.dates import (
     find_order,
@@ -164,9 +164,7 @@ def _duration_unit(cells: Sequence[str]) -> str | None:
     return unit if unit and all(unit_of_duration(cell) == unit for cell in cells) else None
 
 
-def _sample_stamps(
-    layout: Layout, time: Column, rows: Sequence[Sequence[str]]
-) -> NDArray[np.int64]:
+def _sample_stamps(layout: Layout, time: Column, rows: Sequence[Sequence[str]]) -> Ints:
     cells = [row[time.source] for row in rows]
     if time.time_unit is not None:
         cells = [layout.write_point(cell) for cell in cells]

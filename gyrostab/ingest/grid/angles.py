@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, file_of
 from gyrostab.store.lazy import RowSource, make_dask, read_into, read_slice
@@ -26,8 +26,6 @@ _MIN_JUMP, _MAX_PAUSE = 100.0, 2.0
 #: Largest motion of a wrapped angle over missing samples, in periods and at its usual steps, at
 #: which the nearest turn is taken: it may move twice as fast.
 _MAX_UNSEEN = 0.25
-
-Floats = NDArray[np.float64]
 
 
 class TurningAngle:
@@ -55,7 +53,7 @@ class TurningAngle:
         self.added: list[float] = []
         self.jumps: list[int] = []
 
-    def find_turns(self, angles: Floats, stamps: NDArray[np.int64]) -> None:
+    def find_turns(self, angles: Floats, stamps: Ints) -> None:
         """Look through the angles [degree] and stamps [ns] of the next block."""
         places = np.flatnonzero(np.isfinite(angles))
         if places.size:
@@ -68,9 +66,7 @@ class TurningAngle:
             self.last = float(written[-1]), int(times[-1])
         self.first += angles.size
 
-    def _find_in_steps(
-        self, written: Floats, steps: Floats, pauses: NDArray[np.int64], rows: NDArray[np.int64]
-    ) -> None:
+    def _find_in_steps(self, written: Floats, steps: Floats, pauses: Ints, rows: Ints) -> None:
         sizes, span = np.abs(steps), self.high - self.low
         usual = float(np.quantile(sizes[sizes > 0], 0.9)) if (sizes > 0).any() else 0.0
         counters = [size for size in self.counters if size > _MIN_PERIOD * usual]
@@ -116,7 +112,7 @@ class _Continued(RowSource):
         self.rows = [np.array(turn.rows, dtype=np.int64) for turn in turns]
         self.added = [np.cumsum([0.0, *turn.added]) for turn in turns]
 
-    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+    def read_into(self, row: int, begin: int, out: Array) -> None:
         read_into(self.parts[0], row, begin, out)
         turns = np.searchsorted(self.rows[row], np.arange(begin, begin + out.size), side="right")
         out += self.added[row][turns]
@@ -183,7 +179,7 @@ class _Differences(RowSource):
     def __init__(self, array: Any, factor: float):
         self.parts, self.shape, self.factor = (array,), array.shape, factor
 
-    def read_into(self, row: int, begin: int, out: NDArray[Any]) -> None:
+    def read_into(self, row: int, begin: int, out: Array) -> None:
         angles = np.full(out.size + 1, np.nan)
         read_into(self.parts[0], row, max(begin - 1, 0), angles[int(begin == 0) :])
         np.multiply(np.diff(angles), self.factor, out=out)

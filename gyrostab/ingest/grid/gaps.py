@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Ints
 from gyrostab.ingest.gap_table import MISSING, OUTSIDE_RANGE, UNREADABLE, sort_lines
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, find_spans
@@ -15,7 +15,7 @@ from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART, STEP
 from gyrostab.schema import GAP_CAUSES, signal_name
 
 
-def _missing_samples(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
+def _missing_samples(placement: Placement, scanned: ScanPass) -> Ints:
     """List the samples without a row between the runs."""
     runs, events = placement.runs, placement.events
     end, start = runs[:-1, 0] + runs[:-1, 2], runs[1:, 0]
@@ -44,9 +44,7 @@ def _missing_samples(placement: Placement, scanned: ScanPass) -> NDArray[np.int6
     return np.stack([end, start, start - end, skipped, cause], axis=1)[listed]
 
 
-def _unusable_cells(
-    spans: NDArray[np.int64], cause: int, placement: Placement
-) -> NDArray[np.int64]:
+def _unusable_cells(spans: Ints, cause: int, placement: Placement) -> Ints:
     """List the placed rows in which an axis has no usable number; each run has its own lines."""
     runs = placement.runs[np.argsort(placement.runs[:, 1], kind="stable")]
     run_ends = runs[:, 1] + runs[:, 2]
@@ -60,7 +58,7 @@ def _unusable_cells(
     return np.stack([first, first + rows, rows, rows, np.full_like(rows, cause)], axis=1)
 
 
-def _dropped_rows(events: NDArray[np.int64]) -> NDArray[np.int64]:
+def _dropped_rows(events: Ints) -> Ints:
     """List the dropped or moved rows; consecutive rows of one cause are one line."""
     rows = events[np.isin(events[:, 0], (DUPLICATE, OUT_OF_ORDER))]
     rows = rows[np.argsort(rows[:, 2], kind="stable")]
@@ -73,7 +71,7 @@ def _dropped_rows(events: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack([sample, sample, np.zeros_like(count), count, rows[at, 0]], axis=1)
 
 
-def find_gaps(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
+def find_gaps(placement: Placement, scanned: ScanPass) -> Ints:
     """Make the table of all gaps in samples, with the columns of `ingest.gap_table.COLUMNS`."""
     unreadable = [scanned.unreadable]
     if placement.placed > scanned.rows - scanned.absent - scanned.repeated:
@@ -94,7 +92,7 @@ def find_gaps(placement: Placement, scanned: ScanPass) -> NDArray[np.int64]:
     return sort_lines(table)
 
 
-def _missing_spans(log: xr.Dataset) -> NDArray[np.int64]:
+def _missing_spans(log: xr.Dataset) -> Ints:
     """List the spans of samples that are NaN on any axis, read block by block."""
     signal = log[signal_name(log)]
     spans = []

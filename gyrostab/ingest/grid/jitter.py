@@ -11,13 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.ingest.grid.starting_period import (
     SECOND,
     TRACK_GAIN,
     Block,
-    Integers,
     Parts,
     Stamps,
     find_steps,
@@ -79,7 +78,7 @@ class JitterModel:
         return self.nats + float(np.log(max(self.sigma, MIN_SIGMA) * self.period))
 
 
-def observe_rows(stamps: Integers, observe: str, period: float) -> Integers:
+def observe_rows(stamps: Ints, observe: str, period: float) -> Ints:
     """Select the rows whose stamps are used; the last row of a block counts as end of its group."""
     readable = np.flatnonzero(stamps != NO_STAMP)
     if observe == "all" or len(readable) == 0:
@@ -175,9 +174,7 @@ def _observe_parts(parts: Parts, observe: str, period: float) -> list[Block]:
     return observed
 
 
-def _fit_lines(
-    observed: list[Block], length: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+def _fit_lines(observed: list[Block], length: int) -> tuple[Floats, Floats] | None:
     """Fit lines to stretches of `length` stamps: slopes [ns a row], residual sigma [ns]."""
     tables = [
         np.lib.stride_tricks.sliding_window_view(np.stack(block), length, axis=1)[:, :: length // 2]
@@ -195,9 +192,7 @@ def _fit_lines(
     return slope, np.sqrt((residuals**2).sum(axis=1) / (length - 2))
 
 
-def _candidate_periods(
-    observed: list[Block], slope: NDArray[np.float64], group: float
-) -> list[float]:
+def _candidate_periods(observed: list[Block], slope: Floats, group: float) -> list[float]:
     """Return candidate periods [ns] near the smaller slopes; losses increase slopes."""
     longer = _fit_lines(observed, 128)
     min_slope = 0.2 * np.median(slope)
@@ -264,7 +259,7 @@ def _refine_model(
     return JitterModel(period, sigma, jitter.observe, jitter.group, nats / rows, loss_nats, fits)
 
 
-def _price_losses(lost: Integers, loss_nats: float) -> tuple[float, float]:
+def _price_losses(lost: Ints, loss_nats: float) -> tuple[float, float]:
     """Return corrections of the cost of samples lost before each row, and of a loss [nats].
 
     The first is the code length of all losses less their cost in the search for the sequence of
@@ -278,14 +273,14 @@ def _price_losses(lost: Integers, loss_nats: float) -> tuple[float, float]:
     return correction, min(LOSS_NATS, float(np.log((1 - share) / share)))
 
 
-def _is_near(off: NDArray[np.float64], sigma: float) -> NDArray[np.bool_]:
+def _is_near(off: Floats, sigma: float) -> Bools:
     """Return which stamps are not outliers; late rows must not bias the period."""
     return np.asarray(np.abs(off) <= 4 * max(sigma, MIN_SIGMA))
 
 
 def count_samples(
-    rows: Integers, stamps: Integers, jitter: JitterModel, longest: float
-) -> tuple[Integers, Integers, Integers]:
+    rows: Ints, stamps: Ints, jitter: JitterModel, longest: float
+) -> tuple[Ints, Ints, Ints]:
     """Return stamps [ns], sample numbers and piece numbers of the used rows of a block."""
     at = observe_rows(stamps, jitter.observe, jitter.period)
     if jitter.observe != "all":
@@ -317,10 +312,10 @@ def fit_pieces(
     coarse: bool,
     longest: float,
     jitter: JitterModel | None = None,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Sum each unbroken piece: n, mean count, mean stamp [ns], cc, ct, squared residuals."""
 
-    def sum_block(block: Block) -> tuple[Integers, NDArray[np.float64]]:
+    def sum_block(block: Block) -> tuple[Ints, Floats]:
         """Return the first stamp of a block that is used, if any, and the sums of its pieces."""
         values = block[1]
         readable = readable_stamps(values)
@@ -351,9 +346,7 @@ def fit_pieces(
     return table
 
 
-def pool_pieces(
-    pieces: NDArray[np.float64], period: float, counted: bool
-) -> tuple[float, float, float]:
+def pool_pieces(pieces: Floats, period: float, counted: bool) -> tuple[float, float, float]:
     """Pool the pieces: period [ns], three standard errors [ns], longest stretch [samples]."""
     n, cc, ct, residuals = pieces[:, 0], pieces[:, 3], pieces[:, 4], pieces[:, 5]
     if cc.sum() <= 0:
@@ -372,7 +365,7 @@ def pool_pieces(
 
 
 def _join_pieces(
-    pieces: NDArray[np.float64], period: float, error: float, noise: float
+    pieces: Floats, period: float, error: float, noise: float
 ) -> tuple[float, float, float]:
     """Join pieces whose distance is reliably a whole number of samples, and fit again."""
     for _ in range(3):

@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.ingest.gap_table import (
     CLOCK_STEP,
     MISSING,
@@ -97,7 +98,7 @@ def describe_angles(raw: xr.Dataset) -> list[str]:
     ] * bool((shares > _INCREMENT_STEP_SHARE).all())
 
 
-def _one_way_share(values: NDArray[np.float64], lag: int) -> float:
+def _one_way_share(values: Floats, lag: int) -> float:
     """Return the share of steps over `lag` rows in one direction, on the axis with the largest."""
     steps = values[:, lag:] - values[:, :-lag]
     return float(max((steps > 0).mean(axis=1).max(), (steps < 0).mean(axis=1).max()))
@@ -210,7 +211,7 @@ def _describe_local(raw: xr.Dataset, jump: float) -> str:
     return describe_clock_change(jump) if raw.attrs.get("local_time") else ""
 
 
-def _describe_missing(raw: xr.Dataset, placement: Placement, table: NDArray[np.int64]) -> list[str]:
+def _describe_missing(raw: xr.Dataset, placement: Placement, table: Ints) -> list[str]:
     holes = table[(table[:, 4] == MISSING) & (table[:, 2] > 0)]
     if len(holes) == 0:
         return []
@@ -246,7 +247,7 @@ def _name_row(raw: xr.Dataset, row: int) -> str:
 
 
 def describe_placement(
-    raw: xr.Dataset, scanned: ScanPass, placement: Placement, table: NDArray[np.int64]
+    raw: xr.Dataset, scanned: ScanPass, placement: Placement, table: Ints
 ) -> list[str]:
     """Return notes on gaps, restarts, and rows and cells that were dropped or moved."""
     where = record_name(raw)

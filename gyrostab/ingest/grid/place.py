@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.errors import TimeError
 from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.gap_table import format_duration, is_restart
 from gyrostab.ingest.grid.rate import RateEstimate
 from gyrostab.ingest.grid.scan_pass import file_of
-from gyrostab.ingest.grid.starting_period import Integers, Stamps, readable_stamps, recut_blocks
+from gyrostab.ingest.grid.starting_period import Stamps, readable_stamps, recut_blocks
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.kernels.grid import stamps as kernel
 from gyrostab.kernels.grid.stamps import (
@@ -53,10 +53,10 @@ class Placement:
     start: int  # stamp of sample 0 [ns since 1970]
     rate: float  # sampling rate [Hz]
     #: (n, 3): first sample, first row, length; sorted by sample, without overlap.
-    runs: Integers
+    runs: Ints
     #: (n, 5): cause (number in schema.GAP_CAUSES), sample, row, stamp before [ns], stamp [ns];
     #: sorted by sample.
-    events: Integers
+    events: Ints
     #: Largest distance of the smoothed stamps from the grid [samples]; only for counted rows.
     wander: float = 0.0
     #: Stamps from which the rate of the rows deviates from that of the grid [ns since 1970].
@@ -72,7 +72,7 @@ class Placement:
         """Number of rows that have a sample."""
         return int(self.runs[:, 2].sum())
 
-    def samples_of(self, rows: Integers) -> Integers:
+    def samples_of(self, rows: Ints) -> Ints:
         """Return the sample of each row, -1 where the row was not placed."""
         runs = self.runs[np.argsort(self.runs[:, 1], kind="stable")]
         which = np.searchsorted(runs[:, 1], rows, side="right") - 1
@@ -88,7 +88,7 @@ class Placement:
 
 
 def make_placement(
-    start: int, rate: float, runs: list[Integers], events: list[Integers], wander: float = 0.0
+    start: int, rate: float, runs: list[Ints], events: list[Ints], wander: float = 0.0
 ) -> Placement:
     """Make a placement of lists of runs and events, sorted by sample."""
     table = np.concatenate(runs)
@@ -132,7 +132,7 @@ def check_grid(
     )
 
 
-def append_runs(runs: list[Integers], sample: Integers, rows: Integers) -> None:
+def append_runs(runs: list[Ints], sample: Ints, rows: Ints) -> None:
     """Append runs of rows and samples to `runs`; extend the last run if they continue it."""
     new = np.flatnonzero((np.diff(sample) != 1) | (np.diff(rows) != 1)) + 1
     first = np.concatenate([[0], new])
@@ -152,8 +152,8 @@ def place_by_stamp(stamps: Stamps, rate: float, *, max_gap: float, where: str) -
     """
     period = sum(period_ns(rate))
     state, ring = kernel.new_state()
-    runs: list[Integers] = []
-    events: list[Integers] = []
+    runs: list[Ints] = []
+    events: list[Ints] = []
     first = np.empty(0, dtype=np.int64)
     for rows, values in recut_blocks(stamps, _STRETCH_ROWS, LOOK_AHEAD):
         if len(first) == 0:
@@ -168,7 +168,7 @@ def place_by_stamp(stamps: Stamps, rate: float, *, max_gap: float, where: str) -
     return make_placement(_find_start(first, period), rate, runs, events)
 
 
-def _find_start(stamps: Integers, period: float) -> int:
+def _find_start(stamps: Ints, period: float) -> int:
     """Return the first stamp [ns], corrected if it disagrees with all others, which agree."""
     samples = (stamps[1:] - stamps[0]) / period
     off = samples - np.rint(samples)
@@ -182,18 +182,18 @@ def _find_start(stamps: Integers, period: float) -> int:
 class _Windows(NamedTuple):
     """Lead of the stamps over the row count in windows of equal length [samples]."""
 
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    reach: NDArray[np.float64]
-    up: Integers
-    down: Integers
+    low: Floats
+    high: Floats
+    reach: Floats
+    up: Ints
+    down: Ints
 
 
 def _make_windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, int]:
     """Make windows of `width` rows; also return the first stamp [ns]."""
     blocks = (readable_stamps(values) for _, values in stamps())
     zero = next((int(readable[0]) for readable in blocks if len(readable)), 0)
-    parts: list[tuple[NDArray[Any], ...]] = []
+    parts: list[tuple[Array, ...]] = []
     last: list[float] = []  # lead at the end of the previous window
     done = 0
     for _, values in recut_blocks(stamps, max(1, _STRETCH_ROWS // width) * width):
@@ -279,14 +279,12 @@ def place_by_count(
     return make_placement(start, rate, runs, [numbers], wander)
 
 
-def _counted_runs(
-    stamps: Stamps, cuts: Integers, shifts: Integers
-) -> tuple[list[Integers], Integers]:
+def _counted_runs(stamps: Stamps, cuts: Ints, shifts: Ints) -> tuple[list[Ints], Ints]:
     """Make runs of rows by count; from count ``cuts[i]`` on, sample = count + ``shifts[i]``.
 
     Also return the row number of each cut.
     """
-    runs: list[Integers] = []
+    runs: list[Ints] = []
     cut_rows, done = cuts.copy(), 0
     for rows, _ in stamps():
         if len(rows):

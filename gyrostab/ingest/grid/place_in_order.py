@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from gyrostab.arrays import Ints
 from gyrostab.errors import TimeError
 from gyrostab.ingest.gap_table import is_restart
 from gyrostab.ingest.grid.jitter import (
@@ -16,7 +17,7 @@ from gyrostab.ingest.grid.jitter import (
     observe_rows,
 )
 from gyrostab.ingest.grid.place import HOLD, NO_STAMPS, Placement, append_runs, make_placement
-from gyrostab.ingest.grid.starting_period import SECOND, Integers, Stamps, recut_blocks
+from gyrostab.ingest.grid.starting_period import SECOND, Stamps, recut_blocks
 from gyrostab.kernels.grid.course import find_breaks, find_phase, trace
 from gyrostab.kernels.grid.stamps import DUPLICATE, RESTART, STEP
 from gyrostab.time.grid import period_ns
@@ -38,10 +39,10 @@ class _Placer:
         self.start: int | None = None
         self.latest = 0
         self.last = -1  # sample of the latest row
-        self.runs: list[Integers] = []
-        self.events: list[Integers] = []
+        self.runs: list[Ints] = []
+        self.events: list[Ints] = []
 
-    def add(self, rows: Integers, count: Integers, stamps: Integers, n: int) -> None:
+    def add(self, rows: Ints, count: Ints, stamps: Ints, n: int) -> None:
         """Place the first `n` rows of a stretch; the others are look-ahead."""
         at = observe_rows(stamps, self.jitter.observe, self.period)
         if len(at) == 0:
@@ -72,14 +73,14 @@ class _Placer:
         event = [RESTART if is_new else STEP, self.last + 1, row, previous_stamp, stamp]
         self.events.append(np.array([event], dtype=np.int64))
 
-    def _begin_piece(self, count: Integers, stamps: Integers, at: Integers) -> None:
+    def _begin_piece(self, count: Ints, stamps: Ints, at: Ints) -> None:
         """Begin a piece; its first row is the next sample but one, or the first of the log."""
         ahead = find_phase(count[at], stamps[at], self.period, self.sigma)
         self.origin = int(stamps[at[0]]) + int(np.rint(ahead * self.period))
         self.count0, self.level, self.phase, self.observed = int(count[at[0]]), 0, 0.0, 0
         self.base = int(count[at[0]] - count[0])
 
-    def _leave_out_first(self, at: Integers, stamps: Integers) -> Integers:
+    def _leave_out_first(self, at: Ints, stamps: Ints) -> Ints:
         """Leave out the first row if it may be within a group of rows with one stamp, not first."""
         if self.jitter.observe != "first" or len(at) < 2:
             return at
@@ -96,7 +97,7 @@ class _Placer:
             self.base += self.last + 2
 
     def _place_stretch(
-        self, rows: Integers, count: Integers, stamps: Integers, n: int, *, begins: bool
+        self, rows: Ints, count: Ints, stamps: Ints, n: int, *, begins: bool
     ) -> None:
         at = observe_rows(stamps, self.jitter.observe, self.period)
         begins = begins or self.start is None
@@ -139,7 +140,7 @@ class _Placer:
             )
         self._add_rows(rows[:n], count[:n] - self.count0 + level + self.base, stamps[:n])
 
-    def _add_rows(self, rows: Integers, sample: Integers, stamps: Integers) -> None:
+    def _add_rows(self, rows: Ints, sample: Ints, stamps: Ints) -> None:
         """Add runs of rows; a row on or before the sample of the previous row is a duplicate."""
         previous_sample = np.maximum.accumulate(np.concatenate([[self.last], sample[:-1]]))
         is_new = sample > previous_sample

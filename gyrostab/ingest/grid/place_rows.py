@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from gyrostab.arrays import Ints
 from gyrostab.errors import TimeError
 from gyrostab.ingest.columns.pieces import find_even, find_line
 from gyrostab.ingest.columns.stamps import read_stamps
@@ -32,7 +33,7 @@ from gyrostab.ingest.grid.rate import (
     is_far_worse,
 )
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, stamp_blocks
-from gyrostab.ingest.grid.starting_period import SECOND, Integers, Stamps
+from gyrostab.ingest.grid.starting_period import SECOND, Stamps
 from gyrostab.kernels.grid.stamps import DUPLICATE, NO_STAMP, RESTART, STEP
 from gyrostab.schema import signal_name
 from gyrostab.store.lazy import find_source, read_slice
@@ -234,7 +235,7 @@ def _is_sharp(jitter: JitterModel | None) -> bool:
     return jitter is None or jitter.sigma <= _SHARP_SIGMA
 
 
-def find_repeats(raw: xr.Dataset, placement: Placement) -> Integers:
+def find_repeats(raw: xr.Dataset, placement: Placement) -> Ints:
     """Find the rows after each set-back of the clock that repeat rows before it.
 
     Rows are equal if their stamps and values are. A clock that restarts may write the same stamps
@@ -296,7 +297,7 @@ def _count_repeated(raw: xr.Dataset, source: int, row: int) -> int:
     return length if changes and Match(compared, same).alike else 0
 
 
-def find_doubled(raw: xr.Dataset) -> Integers:
+def find_doubled(raw: xr.Dataset) -> Ints:
     """Find the rows that were written twice: they repeat stamp and values of the row before.
 
     Rows that share a stamp because the clock is coarse have other values. Values that are
@@ -305,7 +306,7 @@ def find_doubled(raw: xr.Dataset) -> Integers:
     Returns (n, 3): row, the row that it repeats, and its stamp [ns].
     """
     signal = raw[signal_name(raw)].data
-    tables: list[Integers] = []
+    tables: list[Ints] = []
     shared = same = apart = constant = 0
     for begin, end in _growing_blocks(raw.sizes["row"] - 1):
         stamps = read_stamps(raw, begin, end + 1)
@@ -332,7 +333,7 @@ def find_doubled(raw: xr.Dataset) -> Integers:
     return np.stack([rows, source, stamps], axis=1)
 
 
-def with_repeats(placement: Placement, raw: xr.Dataset, repeats: Integers) -> Placement:
+def with_repeats(placement: Placement, raw: xr.Dataset, repeats: Ints) -> Placement:
     """Add repeated rows as duplicates to the events of a placement made without them."""
     tables = []
     for row, source, length in repeats.tolist():
@@ -342,14 +343,12 @@ def with_repeats(placement: Placement, raw: xr.Dataset, repeats: Integers) -> Pl
     return _with_duplicates(placement, tables)
 
 
-def _duplicate_events(
-    placement: Placement, rows: Integers, source: Integers, stamps: Integers
-) -> Integers:
+def _duplicate_events(placement: Placement, rows: Ints, source: Ints, stamps: Ints) -> Ints:
     """Return events of rows that repeat those of `source`."""
     sample = np.maximum.accumulate(np.maximum(placement.samples_of(source), 0))
     return np.stack([np.full(len(rows), DUPLICATE), sample, rows, stamps, stamps], axis=1)
 
 
-def _with_duplicates(placement: Placement, tables: Sequence[Integers]) -> Placement:
+def _with_duplicates(placement: Placement, tables: Sequence[Ints]) -> Placement:
     table = np.concatenate([placement.events, *tables])
     return replace(placement, events=table[np.argsort(table[:, 1], kind="stable")])

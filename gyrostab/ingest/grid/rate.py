@@ -14,8 +14,8 @@ from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import TimeError
 from gyrostab.ingest.grid.jitter import (
     MIN_SIGMA,
@@ -32,7 +32,6 @@ from gyrostab.ingest.grid.starting_period import (
     PEAK_WIDTH,
     SECOND,
     SHARED_SHARE,
-    Integers,
     Parts,
     Stamps,
     clock_tick,
@@ -369,7 +368,7 @@ def _is_other_period(period: float, other: float) -> bool:
     return abs(period / other - 1) > _MIN_DEVIATION
 
 
-def _stretch_paces(values: Integers) -> tuple[Integers, NDArray[np.float64]]:
+def _stretch_paces(values: Ints) -> tuple[Ints, Floats]:
     """Return first row and median step [ns] of every stretch."""
     n_stretches = len(values) // _STRETCH
     end = n_stretches * _STRETCH

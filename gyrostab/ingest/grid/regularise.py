@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.concat.core import concatenate_logs
 from gyrostab.ingest.concat.grid import split_axes
@@ -126,7 +127,7 @@ def _log_attributes(
     }
 
 
-def _has_unknown_turns(table: NDArray[np.int64], known_steps: float) -> bool:
+def _has_unknown_turns(table: Ints, known_steps: float) -> bool:
     """Return whether a gap is longer than the steps over which the turns of angles are known."""
     lengths = np.where(
         np.isin(table[:, CAUSE], (CLOCK_STEP, RESTART)), np.inf, table[:, END] - table[:, FIRST]
@@ -134,7 +135,7 @@ def _has_unknown_turns(table: NDArray[np.int64], known_steps: float) -> bool:
     return bool(lengths.max(initial=0.0) + 1 > known_steps)
 
 
-def _end_gaps_later(table: NDArray[np.int64], size: int) -> NDArray[np.int64]:
+def _end_gaps_later(table: Ints, size: int) -> Ints:
     """Return a table of gaps of steps since the sample before, which the first sample lacks."""
     later = np.concatenate([[[0, 0, 0, 0, MISSING]], table])
     is_gap = later[:, END] > later[:, FIRST]
@@ -325,7 +326,7 @@ def _place_signal(
     return data, {**signal.encoding, "scale_factor": unit * scale} if unit else {}
 
 
-def _scale_samples(out: NDArray[np.float64], *, scale: float, unit: float | None) -> None:
+def _scale_samples(out: Floats, *, scale: float, unit: float | None) -> None:
     """Scale samples in place, and set infinite ones to NaN."""
     out[np.isinf(out)] = np.nan
     if scale != 1.0:
@@ -353,7 +354,7 @@ def rows_on_grid(
 
 def gather_channel(
     raw: xr.Dataset, name: str, placement: Placement
-) -> tuple[NDArray[np.datetime64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.datetime64], Floats]:
     """Return stamps and values of the filled rows of a slow channel."""
     channel = raw[name].data
     breaks = placement.events[np.isin(placement.events[:, 0], (STEP, RESTART))]

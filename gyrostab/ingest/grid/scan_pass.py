@@ -12,9 +12,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Ints
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.stamps import read_stamps
-from gyrostab.ingest.grid.starting_period import Block, Integers
+from gyrostab.ingest.grid.starting_period import Block
 from gyrostab.ingest.uniform.core import merge_spans
 from gyrostab.schema import texts
 from gyrostab.store.lazy import read_slice
@@ -32,21 +33,21 @@ class ScanPass:
     present: NDArray[np.uint8]  # one bit a row: whether any axis has a number
     absent: int  # rows without any number
     #: (n, 2): half-open spans of present rows in which an axis is NaN, or infinite.
-    unreadable: Integers
-    infinite: Integers
+    unreadable: Ints
+    infinite: Ints
     constant: list[str]  # axes whose value never changes
     empty: list[str]  # axes without a number
     #: Channel on ``row`` -> number of rows with a value.
     filled: dict[str, int] = field(default_factory=dict)
     repeated: int = 0  # number of rows that repeat others
 
-    def leave_out(self, rows: Integers) -> None:
+    def leave_out(self, rows: Ints) -> None:
         """Mark rows as repetitions, which hold no new sample."""
         bits = (128 >> rows % 8).astype(np.uint8)
         self.repeated += int(np.count_nonzero(self.present[rows // 8] & bits))
         np.bitwise_and.at(self.present, rows // 8, ~bits)
 
-    def mask(self, begin: int, end: int) -> NDArray[np.bool_]:
+    def mask(self, begin: int, end: int) -> Bools:
         """Return which of the rows `begin` to `end` hold a sample."""
         bits = np.unpackbits(self.present[begin // 8 : -(-end // 8)])
         return bits[begin % 8 : begin % 8 + end - begin].astype(bool)
@@ -75,7 +76,7 @@ def _scan_block(
     )
 
 
-def find_spans(bad: Any, offset: int) -> Integers:
+def find_spans(bad: Any, offset: int) -> Ints:
     """Return the half-open spans in which `bad` is true, as rows from `offset` on."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]])))
     return np.asarray(edges.reshape(-1, 2) + offset, dtype=np.int64)

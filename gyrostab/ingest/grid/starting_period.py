@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.kernels.grid.stamps import NO_STAMP, track
 
 SECOND = 1e9
@@ -38,12 +38,10 @@ _LONGER = 1.05
 
 #: Least share of the steps that are pauses, of rows in bursts or packets.
 _MIN_PAUSE_SHARE = 0.02
-
-Integers = NDArray[np.int64]
-Parts = list[Integers]
+Parts = list[Ints]
 _Period = TypeVar("_Period", float, float | None)
 #: Rows and their stamps, or the stamps that are used of some rows.
-Block = tuple[Integers, Integers]
+Block = tuple[Ints, Ints]
 #: Returns a new iterator over all blocks of row numbers and stamps at each call.
 Stamps = Callable[[], Iterator[Block]]
 
@@ -79,13 +77,13 @@ def _concatenate_blocks(held: list[Block]) -> Block:
     return rows, values
 
 
-def readable_stamps(block: Integers) -> Integers:
+def readable_stamps(block: Ints) -> Ints:
     """Return the readable stamps, without a copy if all are readable."""
     is_readable = block != NO_STAMP
     return block if is_readable.all() else block[is_readable]
 
 
-def fill_stamps(block: Integers) -> Integers:
+def fill_stamps(block: Ints) -> Ints:
     """Return the stamps from the first to the last readable one, the others evenly between them.
 
     Examples
@@ -98,12 +96,12 @@ def fill_stamps(block: Integers) -> Integers:
         return block[: len(rows)]
     stamps, first = block[rows], block[rows[0]]
     between = np.interp(np.arange(rows[0], rows[-1] + 1), rows, stamps - first)
-    filled: Integers = np.rint(between).astype(np.int64) + first
+    filled: Ints = np.rint(between).astype(np.int64) + first
     filled[rows - rows[0]] = stamps
     return filled
 
 
-def find_steps(parts: Parts) -> Integers:
+def find_steps(parts: Parts) -> Ints:
     """Return the steps [ns] between successive stamps of each stretch."""
     return np.concatenate([np.diff(part) for part in parts])
 
@@ -126,7 +124,7 @@ def sample_stretches(stamps: Stamps) -> Parts:
     return [part for part in stretches if np.count_nonzero(part != NO_STAMP) > 1]
 
 
-def cut_stretches(parts: Parts, length: int) -> NDArray[np.float64]:
+def cut_stretches(parts: Parts, length: int) -> Floats:
     """Return stretches of `length` stamps, relative to the first stamp of each [ns]."""
     stride = length if sum(map(len, parts)) > 200 * length else 1  # overlap in a short log
     stretches = [
@@ -138,7 +136,7 @@ def cut_stretches(parts: Parts, length: int) -> NDArray[np.float64]:
     return np.asarray(table - table[:, :1], dtype=np.float64)
 
 
-def _refine_period(steps: NDArray[np.float64], period: float) -> float:
+def _refine_period(steps: Floats, period: float) -> float:
     """Refine a first guess of the period [ns] of which the steps are multiples, if there is one."""
     start = period
     for _ in range(30):
@@ -199,7 +197,7 @@ def packet_rate(stretches: Parts, rate: float) -> float | None:
     return float(f"{mean:.4g}") if is_packed else None
 
 
-def _residual_range(parts: Parts, length: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _residual_range(parts: Parts, length: int) -> tuple[Floats, Floats]:
     """Fit lines to stretches of `length` stamps: slopes [ns a row], residual ranges [ns]."""
     values = cut_stretches(parts, length)
     x = np.arange(length) - (length - 1) / 2
@@ -208,7 +206,7 @@ def _residual_range(parts: Parts, length: int) -> tuple[NDArray[np.float64], NDA
     return slope, np.ptp(residuals, axis=1) if len(residuals) else np.empty(0)
 
 
-def _has_shared_stamps(parts: Parts, steps: NDArray[np.float64]) -> bool:
+def _has_shared_stamps(parts: Parts, steps: Floats) -> bool:
     """Return whether rows share stamps because the clock is coarse, not by doubling."""
     if np.mean(steps == 0) < SHARED_SHARE:
         return False
@@ -219,13 +217,13 @@ def _has_shared_stamps(parts: Parts, steps: NDArray[np.float64]) -> bool:
     return bool(good.any() and np.median(spread[good] / np.maximum(tick, slope[good])) < 1.3)
 
 
-def rms_misfit(steps: NDArray[np.float64], period: float) -> float:
+def rms_misfit(steps: Floats, period: float) -> float:
     """Return the RMS distance of steps from whole samples [samples]; 0.29 for uniform phases."""
     inliers = steps[np.abs(steps) < 5.5 * period] / period
     return float(np.sqrt(np.mean((inliers - np.rint(inliers)) ** 2))) if len(inliers) else 0.5
 
 
-def step_scatter(steps: Integers | NDArray[np.float64], period: float) -> float:
+def step_scatter(steps: Ints | Floats, period: float) -> float:
     """Return the robust scatter of steps about whole samples [samples]; 0.37 for uniform phases."""
     inliers = steps[np.abs(steps) < 5.5 * period] / period
     return 1.4826 * float(np.median(np.abs(inliers - np.rint(inliers)))) if len(inliers) else 0.5
@@ -305,7 +303,7 @@ def _stamped_period(parts: Parts) -> float:
     return period
 
 
-def _is_bursty(parts: Parts, steps: NDArray[np.float64], period: float) -> bool:
+def _is_bursty(parts: Parts, steps: Floats, period: float) -> bool:
     """Return whether long steps are pauses between bursts, not multiples of the short ones."""
     long = steps[(steps > 1.5 * period) & (steps < 50 * period)]
     inliers = steps[np.abs(steps) < 50 * period]
@@ -341,7 +339,7 @@ def time_per_row(stretches: Parts, *, ticks: bool = False) -> float:
     return float(np.median(totals[is_long, 0] / totals[is_long, 1]))
 
 
-def _tick_steps(steps: NDArray[np.float64], rows: Integers) -> tuple[float, int]:
+def _tick_steps(steps: Floats, rows: Ints) -> tuple[float, int]:
     """Return time [ns] and rows between changes of a shared stamp, without gaps.
 
     A change whose time per row exceeds three times the median is a gap. Each change is kept or left
@@ -415,7 +413,7 @@ def comb_peaks(parts: Parts) -> list[tuple[float, float]]:
     return peaks
 
 
-def _count_stamps(bins: Integers) -> list[NDArray[np.float64]]:
+def _count_stamps(bins: Ints) -> list[Floats]:
     """Count the stamps in each bin, in stretches of `_BINS` bins that hold at least 64 stamps."""
     stretch = bins // _BINS
     numbers, rows = np.unique(stretch, return_counts=True)

@@ -9,8 +9,8 @@ from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.ingest.columns.dates import DAY_FIRST, YEAR_FIRST
 from gyrostab.ingest.columns.headers import VOID_CELLS
 from gyrostab.ingest.columns.plan import Plan
@@ -30,11 +30,11 @@ _MINUS_SIGN = "\N{MINUS SIGN}".encode()
 class ParsedBlock(NamedTuple):
     """Rows of a block of text."""
 
-    values: dict[int, NDArray[np.float64]]  # column number -> numbers, NaN where missing
-    stamps: NDArray[np.int64] | None  # stamps [ns since 1970]
+    values: dict[int, Floats]  # column number -> numbers, NaN where missing
+    stamps: Ints | None  # stamps [ns since 1970]
     words: int  # channel cells that are neither a number nor void
     block: bytes
-    starts: NDArray[np.int64]  # position of each row in the block
+    starts: Ints  # position of each row in the block
     lines: int  # number of lines, with comments and empty lines
     #: Rows that are headers unlike the first one: row, a cell that differs, cell of the first one.
     other_headers: list[tuple[int, str, str]]
@@ -134,8 +134,8 @@ class BlockParser:
     def _parse_cells(
         self,
         lines: dict[int, str],
-        values: NDArray[np.float64],
-        stamps: NDArray[np.int64] | None,
+        values: Floats,
+        stamps: Ints | None,
     ) -> int:
         """Parse rows cell by cell into `values` and `stamps`; return the number of words."""
         rows = [self._split_row(line) for line in lines.values()]

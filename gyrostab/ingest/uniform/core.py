@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Ints
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.concat.lazy import chunk_of, place_array
 from gyrostab.ingest.gap_table import (
@@ -31,7 +31,7 @@ from gyrostab.store.private import close_function, is_in_memory
 from gyrostab.time.grid import TimeGridIndex, grid_index, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
 
-Table = NDArray[np.int64]
+Table = Ints
 
 #: Largest variable that stays in memory after placing [numbers]; 16 MB.
 SMALL_SIZE = 2**21
@@ -119,7 +119,7 @@ def grid_of(log: xr.Dataset, nominal: float | None = None) -> tuple[UniformGrid,
     return find_grid(to_nanoseconds(time.values), nominal=nominal), False
 
 
-def advise_dates(times: NDArray[Any], name: str) -> str:
+def advise_dates(times: Array, name: str) -> str:
     """Return the call that makes datetime64 of cftime dates or pandas periods, or "".
 
     `name` is that of the Dataset or DataArray in the call.
@@ -271,7 +271,7 @@ def merge_spans(spans: Sequence[Table]) -> Table:
     return np.stack(merge_lines(np.concatenate([*spans, np.empty((0, 2), np.int64)])), axis=1)
 
 
-def merge_lines(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def merge_lines(table: Table) -> tuple[Ints, Ints]:
     """Return first samples and ends of the union of the lines of a table."""
     order = np.argsort(table[:, FIRST], kind="stable")
     first, end = table[order, FIRST], np.maximum.accumulate(table[order, END])

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Ints
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.gap_table import OUTSIDE_RANGE, clip_table, read_gaps
 from gyrostab.ingest.uniform.core import (
@@ -234,7 +234,7 @@ def _cut_samples(log: xr.Dataset, kept_grid: UniformGrid, low: int) -> xr.Datase
     return place_samples(log, kept_grid)
 
 
-def _cut_channels(part: xr.Dataset, edges: NDArray[np.int64]) -> xr.Dataset:
+def _cut_channels(part: xr.Dataset, edges: Ints) -> xr.Dataset:
     """Cut the channels with separate time coordinates to kept spans, whose `edges` are in order."""
     for dim in [dim for dim in part.dims if str(dim).startswith("time_") and dim in part.coords]:
         stamps = to_nanoseconds(part.variables[dim].values)
@@ -248,9 +248,9 @@ def _cut_table(
     log: xr.Dataset,
     grid: UniformGrid,
     low: int,
-    kept_spans: NDArray[np.int64],
-    excluded: NDArray[np.int64],
-) -> NDArray[np.int64]:
+    kept_spans: Ints,
+    excluded: Ints,
+) -> Ints:
     table = read_gaps(log, grid.start, grid.rate) if "gap" in log.dims else None
     if table is None:
         table = np.empty((0, 5), dtype=np.int64)

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Ints
 from gyrostab.errors import TimeError
 from gyrostab.ingest.limits import is_absurd_grid
 from gyrostab.time.grid import grid_index
@@ -33,10 +33,10 @@ class UniformGrid(NamedTuple):
     rate: float  # [Hz]
     size: int
     #: (n, 3): first sample of the grid, first sample of the log, length.
-    runs: NDArray[np.int64]
+    runs: Ints
 
 
-def find_grid(stamps: NDArray[np.int64], *, nominal: float | None = None) -> UniformGrid:
+def find_grid(stamps: Ints, *, nominal: float | None = None) -> UniformGrid:
     """Find the slowest uniform grid that contains every stamp [ns since 1970].
 
     `nominal` is the sampling rate that the log declares [Hz]; it is only a candidate, the stamps
@@ -81,7 +81,7 @@ def find_grid(stamps: NDArray[np.int64], *, nominal: float | None = None) -> Uni
     )
 
 
-def _check_order(stamps: NDArray[np.int64]) -> None:
+def _check_order(stamps: Ints) -> None:
     """Refuse stamps that are missing or do not increase."""
     if np.any(stamps == _NAT):
         raise TimeError(
@@ -104,7 +104,7 @@ def _check_order(stamps: NDArray[np.int64]) -> None:
         )
 
 
-def _count_samples(steps: NDArray[np.int64], base: float) -> int:
+def _count_samples(steps: Ints, base: float) -> int:
     """Count the samples for a period near `base` [ns] or a multiple of it; 0 if it is too long."""
     single = steps[np.rint(steps / base) == 1]
     period = int(single.sum()) / single.size if single.size else base
@@ -112,7 +112,7 @@ def _count_samples(steps: NDArray[np.int64], base: float) -> int:
     return 0 if numbers.min() < 1 else int(numbers.sum() // np.gcd.reduce(numbers))
 
 
-def _place_stamps(stamps: NDArray[np.int64], rate: float) -> tuple[float, NDArray[np.int64]] | None:
+def _place_stamps(stamps: Ints, rate: float) -> tuple[float, Ints] | None:
     """Return largest distance from the grid [samples] and runs; None if it is too large."""
     position = grid_index(int(stamps[0]), rate, stamps)
     sample = np.rint(position).astype(np.int64)
@@ -137,7 +137,7 @@ def _plain_rates(
     yield rate
 
 
-def _checked_size(grid: UniformGrid, stamps: NDArray[np.int64]) -> UniformGrid:
+def _checked_size(grid: UniformGrid, stamps: Ints) -> UniformGrid:
     """Refuse a grid that is almost empty."""
     if is_absurd_grid(grid.size, stamps.size):
         begin, end = (np.datetime64(int(stamp), "ns") for stamp in stamps[[0, -1]])

@@ -17,12 +17,10 @@ are noisier, and the window underestimates the noise of the record.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.kernels.allan.blocks import windows_from_blocks
 from gyrostab.kernels.compiled import INNER, KERNEL
 
@@ -45,7 +43,7 @@ EDGE_SAMPLES = 8
 MIN_DIFFERENCES = 100
 
 
-def _measure_noise(x: NDArray[Any], places: NDArray[np.int64]) -> NDArray[np.float64]:
+def _measure_noise(x: Array, places: Ints) -> Floats:
     """Estimate the standard deviation of first differences from second differences; 0 without.
 
     In each row of `places` (n, m), the first `_MEDIAN_OF` with a second difference are used.
@@ -115,7 +113,7 @@ def _find_candidates(x, limits, places, deviations):  # type: ignore[no-untyped-
     return _note_candidate(x, np.int64(x.size - 1), limits[-1], places, deviations, count)
 
 
-def _find_outliers(x: NDArray[Any]) -> NDArray[np.int64]:
+def _find_outliers(x: Array) -> Ints:
     """Find the numbers of the outliers, rising."""
     begins = np.arange(1, max(x.size - 1, 1), _SEGMENT_SAMPLES)
     lengths = np.minimum(begins + _SEGMENT_SAMPLES, x.size - 1) - begins
@@ -142,7 +140,7 @@ def _find_outliers(x: NDArray[Any]) -> NDArray[np.int64]:
     return np.concatenate([np.empty(0, np.int64), *outliers])
 
 
-def count_outliers(x: NDArray[Any], starts: NDArray[np.int64], length: int) -> NDArray[np.float64]:
+def count_outliers(x: Array, starts: Ints, length: int) -> Floats:
     """Count the outliers of each window.
 
     Parameters
@@ -186,9 +184,7 @@ def _edge_blocks(x, step, head, out):  # type: ignore[no-untyped-def]
                 missing -= 0 if np.isfinite(part[0]) else 1
 
 
-def gap_edge_ratio(
-    x: NDArray[Any], *, window: int, step: int, n_windows: int
-) -> NDArray[np.float64]:
+def gap_edge_ratio(x: Array, *, window: int, step: int, n_windows: int) -> Floats:
     """Compute the ratio of mean absolute second differences next to gaps and elsewhere.
 
     Parameters

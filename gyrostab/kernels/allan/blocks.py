@@ -20,8 +20,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Ints
 from gyrostab.kernels.allan.integrate import TILE, integrate_tile
 from gyrostab.kernels.allan.plain_sums import CONSECUTIVE_LAGS, MAX_LAGS
 from gyrostab.kernels.compiled import INNER, KERNEL
@@ -41,13 +41,13 @@ class Cut(NamedTuple):
     """How windows and their terms are cut into blocks."""
 
     step: int  # samples of a block
-    ks: NDArray[np.int64]  # (n_tau,): averaging factors
-    head_lengths: NDArray[np.int64]  # (n_tau,): terms of a head
-    whole_blocks: NDArray[np.int64]  # (n_tau,): blocks of a window, not rising
+    ks: Ints  # (n_tau,): averaging factors
+    head_lengths: Ints  # (n_tau,): terms of a head
+    whole_blocks: Ints  # (n_tau,): blocks of a window, not rising
     n_windows: int  # windows: there are ``n_windows + whole_blocks[0]`` blocks
 
 
-def group_factors(ks: NDArray[np.int64]) -> NDArray[np.int64]:
+def group_factors(ks: Ints) -> Ints:
     """Group the averaging factors that share one pass over the angle: first of each, and the end.
 
     A group has at most `MAX_LAGS` of them, or `CONSECUTIVE_LAGS` that follow each other.
@@ -123,7 +123,7 @@ def _move_to_front(flat, by, held):  # type: ignore[no-untyped-def]
         flat[m] = flat[m + by]
 
 
-def held_points(n_points: int, step: int, ks: NDArray[np.int64]) -> int:
+def held_points(n_points: int, step: int, ks: Ints) -> int:
     """Find how many points of the angle `grouped_blocks` keeps: twice the reach of its terms."""
     return min(4 * int(ks[-1]) + 2 * max(step, _STRETCH_POINTS) + TILE + 1, n_points)
 

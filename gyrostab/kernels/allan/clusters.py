@@ -16,8 +16,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 from numba.extending import intrinsic
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Ints
 from gyrostab.kernels.allan.blocks import windows_from_blocks
 from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
 
@@ -29,7 +29,7 @@ _SECTION = 8
 _GOLDEN = 0.6180339887498949
 
 
-def cluster_strides(window: int, ks: NDArray[np.int64]) -> NDArray[np.int64]:
+def cluster_strides(window: int, ks: Ints) -> Ints:
     """Choose the distance of the pairs of clusters, a power of two.
 
     Pairs closer than k/16 add almost no information if many of them fit the window; if 256 or fewer

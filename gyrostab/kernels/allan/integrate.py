@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Ints
 from gyrostab.kernels.allan.plain_sums import LANES, MAX_LAGS
 from gyrostab.kernels.compiled import INNER, KERNEL
 
@@ -20,7 +20,7 @@ TILE = 4096
 _PLAIN = 1e7
 
 
-def present_runs(x: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def present_runs(x: Array) -> tuple[Ints, Ints]:
     """Find first and one-past-last index of every run of finite samples."""
     present = np.isfinite(x)
     edges = np.flatnonzero(present[1:] != present[:-1]) + 1
@@ -150,7 +150,7 @@ def needs_two_doubles(largest: float, x: NDArray[np.generic]) -> bool:
     return bool(change.size > 0 and largest > _PLAIN * np.median(change))
 
 
-def padded_size(n_points: int, ks: NDArray[np.int64]) -> int:
+def padded_size(n_points: int, ks: Ints) -> int:
     """Find the size of an array for `n_points` and what `split_sums` reads and ignores behind them.
 
     `gyrostab.kernels.allan.vectors.split_sums` reads as far with the longest of its lags as with

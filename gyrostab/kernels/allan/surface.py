@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.kernels.allan.blocks import (
     Cut,
     group_factors,
@@ -37,8 +38,6 @@ from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.workspace import Workspace
 
 NONE, STRICT, WEIGHTED = 0, 1, 2
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # Types that are summed as they are; others become double first, since each type is compiled anew.
 _NATIVE = np.dtype(np.float64), np.dtype(np.float32)
@@ -65,7 +64,7 @@ class Unit(NamedTuple):
 
     window: int
     step: int
-    ks: NDArray[np.int64]
+    ks: Ints
     angle: bool
     interval: float
     min_strict: float
@@ -78,12 +77,12 @@ class Unit(NamedTuple):
         return VARIANCES[self.variance].order
 
     @property
-    def spans(self) -> Integers:
+    def spans(self) -> Ints:
         """Samples that a term uses, (n_tau,)."""
         return VARIANCES[self.variance].spans(self.ks)
 
     @property
-    def lengths(self) -> Integers:
+    def lengths(self) -> Ints:
         """Terms of a window without gaps, (n_tau,)."""
         return self.window - self.spans + 1
 
@@ -115,8 +114,8 @@ class _Work(NamedTuple):
     unit: Unit
     space: Workspace
     n_windows: int
-    starts: Integers
-    stops: Integers
+    starts: Ints
+    stops: Ints
     offset: float
 
 
@@ -166,7 +165,7 @@ def _grouped_blocks(work: _Work, cut: Cut, blocks: Floats) -> None:
         _interval_blocks(work, cut, blocks)
 
 
-def _angle_of(work: _Work, windows: Integers) -> Floats:
+def _angle_of(work: _Work, windows: Ints) -> Floats:
     """Take the angles (n + 1,) of some windows and the block behind each, each from zero on."""
     x, unit = work.x, work.unit
     angle = work.space.array("angle", x.size + 1)
@@ -290,7 +289,7 @@ def _cells_with_gaps(work: _Work, sums: Floats, counts: Floats, full: Floats) ->
     return Cells(*cells)
 
 
-def _bridge_gaps(work: _Work, theta: Floats, poor: NDArray[np.bool_], cells: Floats) -> None:
+def _bridge_gaps(work: _Work, theta: Floats, poor: Bools, cells: Floats) -> None:
     """Weighted clusters where too few terms are left (rate logs only)."""
     unit, runs = work.unit, (work.starts, work.stops, theta.size - 1)
     mask = pack_mask(*runs)
@@ -309,7 +308,7 @@ def _bridge_gaps(work: _Work, theta: Floats, poor: NDArray[np.bool_], cells: Flo
         cells[:, rows, i] = np.stack(fields)[:, rows]
 
 
-def _find_slopes(work: _Work, with_gaps: NDArray[np.bool_]) -> Floats:
+def _find_slopes(work: _Work, with_gaps: Bools) -> Floats:
     """Find the slope of the rate that the second differences of windows with gaps show."""
     x, unit, space, n_windows, starts, stops, offset = work
     if unit.order == 3:

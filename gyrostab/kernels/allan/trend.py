@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Array, Bools, Floats, Ints
 from gyrostab.kernels.allan.blocks import windows_from_blocks
 from gyrostab.kernels.allan.intervals import valid_intervals
 from gyrostab.kernels.compiled import INNER, KERNEL
@@ -51,7 +50,7 @@ def _block_moments(x, angle, base, window, step, n_windows):  # type: ignore[no-
     return heads, tails
 
 
-def _typical_rate(x: NDArray[Any], present: NDArray[np.bool_], angle: bool) -> float:
+def _typical_rate(x: Array, present: Bools, angle: bool) -> float:
     """Find the median of some rates; a damaged one would cost the sums of others their digits."""
     apart = max(1, present.size // 256)
     places = np.append(np.argmax(present), apart * np.flatnonzero(present[::apart]))
@@ -60,8 +59,8 @@ def _typical_rate(x: NDArray[Any], present: NDArray[np.bool_], angle: bool) -> f
 
 
 def window_lines(
-    x: NDArray[Any], *, angle: bool, window: int, step: int, n_windows: int
-) -> tuple[NDArray[np.float64], float]:
+    x: Array, *, angle: bool, window: int, step: int, n_windows: int
+) -> tuple[Floats, float]:
     """Fit a straight line to the rates of each window.
 
     The rate over a gap of angles is the difference of those on both sides, with the weight of all
@@ -134,7 +133,7 @@ def window_lines(
 class _HeldAngles:
     """Angles that are present, the rates between them, and those of each window."""
 
-    def __init__(self, places: NDArray[np.int64], starts: NDArray[np.int64], window: int) -> None:
+    def __init__(self, places: Ints, starts: Ints, window: int) -> None:
         self.places, self.starts, self.window = places, starts, window
         most = places.size - 1
         self.first = np.minimum(np.searchsorted(places, starts), most)
@@ -144,9 +143,7 @@ class _HeldAngles:
         self.apart = np.diff(places)
         self.middles = places[:-1] + 0.5 * (self.apart - 1.0)
 
-    def remove_partial(
-        self, moments: NDArray[np.float64], x: NDArray[np.float64], base: float
-    ) -> None:
+    def remove_partial(self, moments: Floats, x: Floats, base: float) -> None:
         """Remove what lies between an angle in a window and one outside it, from samples of `x`.
 
         The spread of places between two angles is removed, too, because only their mean is known.
@@ -165,9 +162,7 @@ class _HeldAngles:
         moments[:, 2] -= spreads[self.last] - spreads[self.first]
         moments[self.last == self.first] = 0.0
 
-    def edge_squares(
-        self, windows: NDArray[np.int64], centre: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def edge_squares(self, windows: Ints, centre: Floats) -> Floats:
         """Do what `_edge_squares` does: the weights of neighbours are their middles' distance."""
         squares = np.cumsum(np.append(0.0, np.diff(self.middles) ** 2))
         first = np.minimum(self.first[windows], squares.size - 1)
@@ -175,9 +170,7 @@ class _HeldAngles:
         ends = (self.middles[first] - centre) ** 2 + (self.middles[last] - centre) ** 2
         return np.asarray(ends + squares[last] - squares[first])
 
-    def count_parts(
-        self, windows: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def count_parts(self, windows: Ints) -> tuple[Floats, Floats]:
         """Do what `_count_parts` does, with the samples between two angles at their middle."""
         edges, _ = _part_covariances(self.window)
         sums = np.zeros(self.places[-1] + 1)
@@ -190,12 +183,12 @@ class _HeldAngles:
 
 
 def _edge_squares(
-    present: NDArray[np.bool_],
-    starts: NDArray[np.int64],
+    present: Bools,
+    starts: Ints,
     window: int,
-    count: NDArray[np.float64],
-    centre: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    count: Floats,
+    centre: Floats,
+) -> Floats:
     """Sum the squared weights of the angles in ``sum (place - centre) rate`` of each window.
 
     Inside a run of rates the weights of neighbours differ by one; at its edges they remain.
@@ -222,9 +215,7 @@ def _edge_squares(
     return squares + count - 0.5 * edges
 
 
-def _count_parts(
-    present: NDArray[np.bool_], starts: NDArray[np.int64], window: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _count_parts(present: Bools, starts: Ints, window: int) -> tuple[Floats, Floats]:
     """Count the samples in each part of each window, and sum their places as if evenly spread."""
     edges, _ = _part_covariances(window)
     sums = np.zeros(present.size + 1, dtype=np.int32)
@@ -233,9 +224,7 @@ def _count_parts(
     return counts, counts * (0.5 * (edges[1:] + edges[:-1] - 1.0))
 
 
-def _slow_responses(
-    counts: NDArray[np.float64], places: NDArray[np.float64], window: int
-) -> NDArray[np.float64]:
+def _slow_responses(counts: Floats, places: Floats, window: int) -> Floats:
     """Compute the variance of ``sum (place - mean place) rate`` under B and K, (2, n_windows).
 
     Relative to a window without gaps. `counts` and sums of `places` are (n_windows, parts).
@@ -252,7 +241,7 @@ def _slow_responses(
 
 
 @lru_cache(maxsize=4)
-def _part_covariances(window: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _part_covariances(window: int) -> tuple[Ints, Floats]:
     """Divide a window; covariance of the mean rates of its parts under B and K, (2, parts, parts).
 
     Apart from what is common to all rates.

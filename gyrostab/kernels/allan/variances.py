@@ -21,7 +21,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from gyrostab.arrays import Floats, Ints
 
 
 class Variance(NamedTuple):
@@ -31,11 +32,11 @@ class Variance(NamedTuple):
     order: int
     summed: bool
 
-    def spans(self, ks: NDArray[np.int64]) -> NDArray[np.int64]:
+    def spans(self, ks: Ints) -> Ints:
         """Samples that a term uses; a window has ``window - span + 1`` terms."""
         return self.order * ks - self.summed
 
-    def divisors(self, ks: NDArray[np.int64]) -> NDArray[np.float64]:
+    def divisors(self, ks: Ints) -> Floats:
         """Divisor of a mean squared difference, for a sampling interval of 1."""
         squares = ks.astype(np.float64) ** 2
         return 2.0 * squares**2 if self.summed else (6.0 if self.order == 3 else 2.0) * squares

@@ -6,8 +6,8 @@ from fractions import Fraction
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.kernels.compiled import INNER
 
 _PLUS, _MINUS, _ZERO, _SMALL_E = b"+-0e"
@@ -17,7 +17,7 @@ _TENS = 10.0 ** np.arange(23)
 _LEAST, _MOST = -60, 40
 
 
-def _powers_of_ten() -> NDArray[np.float64]:
+def _powers_of_ten() -> Floats:
     """Compute the powers of ten from `_LEAST` to `_MOST`, each as a sum of two doubles."""
     exact = [Fraction(10) ** power for power in range(_LEAST, _MOST + 1)]
     return np.array([(float(ten), float(ten - Fraction(float(ten)))) for ten in exact])

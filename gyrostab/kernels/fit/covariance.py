@@ -23,8 +23,8 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
 
@@ -38,7 +38,7 @@ _THIRD_WEIGHTS = (-1.0, 3.0, -3.0, 1.0)
 _FAR = 1e4
 
 
-def angle_covariances(term: int, lags: NDArray[np.float64]) -> NDArray[np.float64]:
+def angle_covariances(term: int, lags: Floats) -> Floats:
     """Compute the generalised autocovariance of the angle under Q, N, B or K (0 to 3)."""
     if term == 0:
         return np.where(lags == 0, 1.0, 0.0)
@@ -55,7 +55,7 @@ def angle_covariances(term: int, lags: NDArray[np.float64]) -> NDArray[np.float6
     return out
 
 
-def autocovariances(lags: int, *, summed: bool) -> NDArray[np.float64]:
+def autocovariances(lags: int, *, summed: bool) -> Floats:
     """Compute the generalised autocovariances of Q, N, B and K, (4, lags)."""
     t = np.arange(lags, dtype=np.float64)
     out = np.empty((STOCHASTIC, lags))
@@ -322,11 +322,11 @@ def _fill_tables(window, ks, order, summed, diagonal, logarithm, table):  # type
 
 def product_tables(
     window: int,
-    ks: NDArray[np.int64],
+    ks: Ints,
     *,
     variance: str = "avar",
     diagonal: bool = False,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Tabulate the covariance of a variance per product of squares, and with a ramp.
 
     Parameters
@@ -359,7 +359,7 @@ def product_tables(
     return (pairs[..., 0], ramps[..., 0]) if diagonal else (pairs, ramps)
 
 
-def _log_lags(window: int, longest: int) -> NDArray[np.float64]:
+def _log_lags(window: int, longest: int) -> Floats:
     """``ln t`` for every lag that can occur, 0 at t = 0."""
     lags = max(window, _reached_lags.py_func(window, longest) + 2 * _LAG_STEPS)
     t = np.arange(lags + 1, dtype=np.float64)
@@ -367,7 +367,7 @@ def _log_lags(window: int, longest: int) -> NDArray[np.float64]:
     return np.log(t, out=t)
 
 
-def third_columns(variance: str, ks: NDArray[np.int64]) -> NDArray[np.float64]:
+def third_columns(variance: str, ks: Ints) -> Floats:
     """Compute the variance per squared coefficient in sample units, (n_tau, 5).
 
     Examples

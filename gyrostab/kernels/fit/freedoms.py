@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.kernels.compiled import INNER, KERNEL
 
 
-def combine_diagonal(
-    pairs: NDArray[np.float64], ramps: NDArray[np.float64], strides: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def combine_diagonal(pairs: Floats, ramps: Floats, strides: Ints) -> Floats:
     """Combine the diagonals (4, 4, n_tau) and (4, n_tau) of `product_tables`: (n_tau, 15).
 
     Last is what the `strides` of pairs of clusters add to the product of quantization noise with
     itself, which has a covariance at single lags only.
     """
-    columns: list[NDArray[np.float64]] = []
+    columns: list[Floats] = []
     for a in range(4):
         columns += [pairs[a, b] * (1.0 if a == b else 2.0) for b in range(a, 4)]
         columns.append(ramps[a])

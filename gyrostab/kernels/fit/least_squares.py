@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.kernels.compiled import INNER, KERNEL
 from gyrostab.kernels.fit.averages import FIT_FIELDS, average_submodels
 from gyrostab.kernels.fit.eight_solvers import (
@@ -46,25 +46,25 @@ _ONE, _STOCHASTIC, _TERMS, _MATRIX, _SCRATCH = (np.int64(size) for size in (1, 4
 class _Cells(NamedTuple):
     """What `observe` and `describe_gaps` say of eight windows."""
 
-    system: NDArray[np.float64]
-    responses: NDArray[np.float64]
-    inverse: NDArray[np.float64]
-    avar: NDArray[np.float64]
-    excess: NDArray[np.float64]
-    jumps: NDArray[np.float64]
-    thinned: NDArray[np.float64]
+    system: Floats
+    responses: Floats
+    inverse: Floats
+    avar: Floats
+    excess: Floats
+    jumps: Floats
+    thinned: Floats
     #: Variance of the trend per squared coefficient (rows 0 to 3), and the squared trend (4).
-    trend: NDArray[np.float64]
+    trend: Floats
 
 
 class _Fit(NamedTuple):
     """Eight fits: squared coefficients, sets of positive terms, normal equations, and scratch."""
 
-    squares: NDArray[np.float64]
-    terms: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    right: NDArray[np.float64]
-    scratch: NDArray[np.float64]
+    squares: Floats
+    terms: Floats
+    normal: Floats
+    right: Floats
+    scratch: Floats
 
 
 @njit(**INNER)

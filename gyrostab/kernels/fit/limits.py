@@ -6,12 +6,10 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.kernels.compiled import INNER, KERNEL
 from gyrostab.kernels.fit.mixture import Curves
-
-Floats = NDArray[np.float64]
 
 #: Largest number of Newton steps to a bound, and the change of the score that ends them.
 _STEPS, _TOLERANCE = 20, 1e-6

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.kernels.compiled import INNER
 from gyrostab.kernels.fit.lanes import eights, number, put, root, take, take_four, where_above
 
@@ -41,11 +41,11 @@ class Curves(NamedTuple):
     (1, n_tau) where all windows have the same.
     """
 
-    avar: NDArray[np.float64]
-    white: NDArray[np.float64]
-    quantization: NDArray[np.float64]
-    ramp: NDArray[np.float64]
-    factor: NDArray[np.float64]
+    avar: Floats
+    white: Floats
+    quantization: Floats
+    ramp: Floats
+    factor: Floats
 
 
 @njit(**INNER)

@@ -12,8 +12,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.kernels.fit.covariance import STOCHASTIC, angle_covariances
 
 #: Second differences are taken at steps of this share of k, and at this many places at least.
@@ -23,12 +23,12 @@ _STEPS, _PLACES = 32, 2**16
 class TrendTables(NamedTuple):
     """Variance of the slope per squared coefficient (4,), and `product_tables` of z."""
 
-    variance: NDArray[np.float64]
-    pairs: NDArray[np.float64]
-    ramps: NDArray[np.float64]
+    variance: Floats
+    pairs: Floats
+    ramps: Floats
 
 
-def _slope_covariances(window: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _slope_covariances(window: int) -> tuple[Floats, Floats]:
     """Compute the covariance of each angle with the slope (4, window + 2), and that of the slope.
 
     A zero precedes those of the angles, for sums of them. The slope weights the angles by -1/S, and
@@ -56,9 +56,9 @@ def _slope_covariances(window: int) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 def detrend_tables(
     window: int,
-    ks: NDArray[np.int64],
-    pairs: NDArray[np.float64],
-    ramps: NDArray[np.float64],
+    ks: Ints,
+    pairs: Floats,
+    ramps: Floats,
     *,
     summed: bool = False,
 ) -> TrendTables:

@@ -18,12 +18,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.linalg import expm, solve_continuous_lyapunov
 
+from gyrostab.arrays import Floats
 from gyrostab.kernels.compiled import KERNEL
-
-Array = NDArray[np.float64]
 
 #: Order of the Butterworth low-pass from which a band is made: the band has twice as many poles.
 ORDER = 6
@@ -37,12 +35,12 @@ _SLOW = 1e-2
 class Reading(NamedTuple):
     """Transition of a process from sample to sample, and its output."""
 
-    step: Array  # (d, d): state at the next sample from the state at this one
-    read: Array  # (d,): reading from the state at this sample
+    step: Floats  # (d, d): state at the next sample from the state at this one
+    read: Floats  # (d,): reading from the state at this sample
     # (d + 1, d + 1): lower triangle; from standard normal numbers to the fresh parts of state and
     # reading
-    kick: Array
-    spread: Array  # (d, d): from standard normal numbers to a state of the stationary process
+    kick: Floats
+    spread: Floats  # (d, d): from standard normal numbers to a state of the stationary process
 
 
 class _Section(NamedTuple):
@@ -56,7 +54,7 @@ class _Section(NamedTuple):
     velocity: bool
 
 
-def _chain_sections(sections: Sequence[_Section]) -> tuple[Array, Array, Array]:
+def _chain_sections(sections: Sequence[_Section]) -> tuple[Floats, Floats, Floats]:
     """Connect sections in series: state matrix, noise input, output; two states per section."""
     size = 2 * len(sections)
     a, b = np.zeros((size, size)), np.zeros(size)
@@ -76,14 +74,14 @@ def _chain_sections(sections: Sequence[_Section]) -> tuple[Array, Array, Array]:
     return a, b, drive
 
 
-def _factor_covariance(covariance: Array) -> Array:
+def _factor_covariance(covariance: Floats) -> Floats:
     """Factor a covariance, which may be singular, into a lower triangle."""
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     return np.ascontiguousarray(np.asarray(np.linalg.qr(root.T, mode="r")).T)
 
 
-def _integrate_moments(a: Array, b: Array, c: Array, rate: float) -> tuple[Array, Array]:
+def _integrate_moments(a: Floats, b: Floats, c: Floats, rate: float) -> tuple[Floats, Floats]:
     """Integrate over a slow sample: mean of the output by state, covariance of the fresh parts.
 
     Nothing is subtracted, but the inverse of the transition must be of moderate size (Van Loan).
@@ -101,7 +99,7 @@ def _integrate_moments(a: Array, b: Array, c: Array, rate: float) -> tuple[Array
 
 
 def _make_reading(
-    a: Array, b: Array, covariance: Array, c: Array, rate: float, *, average: bool
+    a: Floats, b: Floats, covariance: Floats, c: Floats, rate: float, *, average: bool
 ) -> Reading:
     """Sample a stationary process with state matrix `a` [s-1] and the output `c` at `rate` [Hz].
 
@@ -165,7 +163,7 @@ def mount(resonance: float, quality: float, rate: float, *, average: bool = True
     """
     omega = 2.0 * math.pi * resonance
     a, b, c = _chain_sections([_Section(omega, omega / quality, False)])
-    covariance: Array = np.asarray(solve_continuous_lyapunov(a, -np.outer(b, b)), np.float64)
+    covariance: Floats = np.asarray(solve_continuous_lyapunov(a, -np.outer(b, b)), np.float64)
     return _make_reading(a, b, covariance, c, rate, average=average)
 
 
@@ -228,7 +226,7 @@ class Process(NamedTuple):
 
     reading: Reading
     rng: np.random.Generator
-    position: Array
+    position: Floats
 
 
 def begin_process(reading: Reading, rng: np.random.Generator) -> Process:
@@ -236,7 +234,7 @@ def begin_process(reading: Reading, rng: np.random.Generator) -> Process:
     return Process(reading, rng, reading.spread @ rng.standard_normal(reading.read.size))
 
 
-def read_process(process: Process, size: int) -> tuple[Array, Process]:
+def read_process(process: Process, size: int) -> tuple[Floats, Process]:
     """Read the process at the next `size` samples; return also what follows them."""
     reading, rng, position = process
     normal = rng.standard_normal((size, position.size + 1))
@@ -246,8 +244,8 @@ def read_process(process: Process, size: int) -> tuple[Array, Process]:
 
 @njit(**KERNEL)
 def _read_samples(
-    step: Array, read: Array, kick: Array, normal: Array, position: Array
-) -> tuple[Array, Array]:
+    step: Floats, read: Floats, kick: Floats, normal: Floats, position: Floats
+) -> tuple[Floats, Floats]:
     """Read the process at the samples: the values (n,), and the state (d,) after the last.
 
     `normal` holds standard normal numbers (n, d + 1).
@@ -277,15 +275,15 @@ def _read_samples(
 # the same in frequency
 
 
-def oscillator_psd(f: Array, frequency: float, quality: float) -> Array:
+def oscillator_psd(f: Floats, frequency: float, quality: float) -> Floats:
     """Compute the two-sided density [Hz-1] of `oscillator` in continuous time."""
     width = frequency / quality
     return np.asarray(width * f**2 / (math.pi * ((f**2 - frequency**2) ** 2 + (width * f) ** 2)))
 
 
 def band_psd(
-    f: Array, low: float, high: float, resonance: float = 0.0, quality: float = 1.0
-) -> Array:
+    f: Floats, low: float, high: float, resonance: float = 0.0, quality: float = 1.0
+) -> Floats:
     """Compute the two-sided density [Hz-1] of `band` in continuous time."""
     x = (f**2 - low * high) / ((high - low) * np.maximum(np.abs(f), 1e-9 * low))
     share = math.pi / (2 * ORDER)
@@ -295,14 +293,14 @@ def band_psd(
     return np.asarray(density)
 
 
-def mount_psd(f: Array, resonance: float, quality: float) -> Array:
+def mount_psd(f: Floats, resonance: float, quality: float) -> Floats:
     """Compute the two-sided density [Hz-1] of `mount` in continuous time."""
     return np.asarray(resonance**4 / ((f**2 - resonance**2) ** 2 + (f * resonance / quality) ** 2))
 
 
 def folded_psd(
-    density: Callable[[Array], Array], f: Array, rate: float, highest: float, *, average: bool
-) -> Array:
+    density: Callable[[Floats], Floats], f: Floats, rate: float, highest: float, *, average: bool
+) -> Floats:
     """Fold the two-sided density of a process into that of its samples.
 
     Parameters

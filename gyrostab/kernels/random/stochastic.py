@@ -12,11 +12,9 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.kernels.compiled import KERNEL
-
-Array = NDArray[np.float64]
 
 #: Ratio of neighbouring correlation times in `flicker_times`: the Allan variance of their sum
 #: departs from flat by 0.2 %.
@@ -25,7 +23,7 @@ RATIO = 5.0
 SHORTEST = 1.0 / 12.0
 
 
-def brownian_means(steps: Array, inner: Array, carry: float) -> tuple[Array, float]:
+def brownian_means(steps: Floats, inner: Floats, carry: float) -> tuple[Floats, float]:
     """Average a Brownian motion with the increments `steps` over the samples.
 
     The mean over an interval with the increment d is the start plus d / 2 plus an independent part
@@ -52,8 +50,8 @@ def brownian_means(steps: Array, inner: Array, carry: float) -> tuple[Array, flo
 
 @njit(**KERNEL)
 def ornstein_uhlenbeck(
-    normal: Array, decay: Array, weight: Array, rest_deviation: float, position: Array
-) -> tuple[Array, Array]:
+    normal: Floats, decay: Floats, weight: Floats, rest_deviation: float, position: Floats
+) -> tuple[Floats, Floats]:
     """Sum the sample means of Ornstein-Uhlenbeck processes of unit variance.
 
     Parameters
@@ -91,7 +89,7 @@ def ornstein_uhlenbeck(
     return total, x
 
 
-def _mean_moments(samples: Array) -> tuple[Array, Array, Array]:
+def _mean_moments(samples: Floats) -> tuple[Floats, Floats, Floats]:
     """Compute decay over a sample, weight of both ends in its mean, and variance of the rest."""
     a = 1.0 / samples
     decay = -np.expm1(-a)
@@ -103,7 +101,9 @@ def _mean_moments(samples: Array) -> tuple[Array, Array, Array]:
     return decay, weight, rest_variance
 
 
-def ornstein_uhlenbeck_means(normal: Array, samples: float, position: float) -> tuple[Array, float]:
+def ornstein_uhlenbeck_means(
+    normal: Floats, samples: float, position: float
+) -> tuple[Floats, float]:
     """Make sample means of an Ornstein-Uhlenbeck (first-order Gauss-Markov) process.
 
     Parameters
@@ -134,7 +134,7 @@ def ornstein_uhlenbeck_means(normal: Array, samples: float, position: float) -> 
     return total, float(last[0])
 
 
-def flicker_times(rate: float, *, low: float, high: float = math.inf) -> Array:
+def flicker_times(rate: float, *, low: float, high: float = math.inf) -> Floats:
     """Choose the correlation times [s] of the processes of flicker noise at `rate` [Hz].
 
     They are evenly spaced in log, beginning at ``1 / (2 pi low)`` [s], so that another `rate` adds
@@ -148,8 +148,8 @@ def flicker_times(rate: float, *, low: float, high: float = math.inf) -> Array:
 
 
 def flicker_means(
-    normal: Array, times: Array, rate: float, position: Array, *, endless: bool = True
-) -> tuple[Array, Array]:
+    normal: Floats, times: Floats, rate: float, position: Floats, *, endless: bool = True
+) -> tuple[Floats, Floats]:
     """Make sample means of flicker noise with B = 1.
 
     Parameters

@@ -8,12 +8,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.sparse import csr_array
 from scipy.special import stdtr, stdtrit
 
-Array = NDArray[np.float64]
+from gyrostab.arrays import Floats, Ints
 
 #: Correlation times of the slow part [share of the record], and its spectral density against the
 #: white part's at one cycle per record.
@@ -32,24 +31,24 @@ _STEEPEST = 1.5  # power of the share against the p-value in the tail, at most
 class Laws(NamedTuple):
     """Noise laws of some blocks with nuisance columns: covariance factors and whitening."""
 
-    factor: Array  # (law, n, n)
-    whiten: Array  # (law, n, n)
-    log_det: Array
-    prior: Array
+    factor: Floats  # (law, n, n)
+    whiten: Floats  # (law, n, n)
+    log_det: Floats
+    prior: Floats
     freedom: int
 
 
 class LagFit(NamedTuple):
     """Slopes by (noise law, series, lag), with the log weights of the laws."""
 
-    slope: Array
-    stderr: Array
-    log_weight: Array
-    log_without: Array  # (law, series)
+    slope: Floats
+    stderr: Floats
+    log_weight: Floats
+    log_without: Floats  # (law, series)
     freedom: int
 
 
-def noise_laws(mean: Any, time: Array, length: float, share: Array) -> Laws:
+def noise_laws(mean: Any, time: Floats, length: float, share: Floats) -> Laws:
     """Make the noise laws of blocks of windows, with their prior weights.
 
     White noise alone, and white noise with a slow part: an Ornstein-Uhlenbeck process, which is a
@@ -80,7 +79,7 @@ def noise_laws(mean: Any, time: Array, length: float, share: Array) -> Laws:
     return decompose(family, np.log(prior))
 
 
-def decompose(family: list[Array], prior: Array) -> Laws:
+def decompose(family: list[Floats], prior: Floats) -> Laws:
     """Factor covariances (n, n), each with the logarithm of its prior weight."""
     factor, n = np.linalg.cholesky(np.array(family)), family[0].shape[0]
     whiten = np.array(
@@ -93,7 +92,7 @@ def decompose(family: list[Array], prior: Array) -> Laws:
     return Laws(factor, whiten, log_det, np.asarray(prior), n - 1)
 
 
-def project_out(laws: Laws, nuisance: Array) -> Laws:
+def project_out(laws: Laws, nuisance: Floats) -> Laws:
     """Add nuisance columns (n, p) to the noise laws; whitened series are orthogonal to them."""
     q, r = np.linalg.qr(laws.whiten @ nuisance)
     free = laws.whiten - q @ (np.swapaxes(q, 1, 2) @ laws.whiten)
@@ -102,7 +101,7 @@ def project_out(laws: Laws, nuisance: Array) -> Laws:
     return Laws(laws.factor, free, laws.log_det + log_h, laws.prior, freedom)
 
 
-def fit_lags(laws: Laws, series: Array, driver: Array) -> LagFit:
+def fit_lags(laws: Laws, series: Floats, driver: Floats) -> LagFit:
     """Fit the slope of every series on the driver at every lag, under every noise law.
 
     Parameters
@@ -130,34 +129,34 @@ def fit_lags(laws: Laws, series: Array, driver: Array) -> LagFit:
     return LagFit(xy / xx, np.sqrt(residual / laws.freedom / xx), weight, without, laws.freedom)
 
 
-def weights(fit: LagFit) -> Array:
+def weights(fit: LagFit) -> Floats:
     """Compute the weights of the laws, (law, series, lag), with a sum of one."""
     raw = np.exp(fit.log_weight - fit.log_weight.max(axis=0))
     return np.asarray(raw / raw.sum(axis=0))
 
 
-def null_weights(fit: LagFit, series: int) -> Array:
+def null_weights(fit: LagFit, series: int) -> Floats:
     """Compute the weights of the laws if nothing follows the driver."""
     raw = np.exp(fit.log_without[:, series] - fit.log_without[:, series].max())
     return np.asarray(raw / raw.sum())
 
 
-def mixture(fit: LagFit) -> tuple[Array, Array]:
+def mixture(fit: LagFit) -> tuple[Floats, Floats]:
     """Average the slope by (series, lag) over the noise laws: mean and standard deviation."""
     weight = weights(fit)
     mean = (weight * fit.slope).sum(axis=0)
     return mean, np.sqrt((weight * (fit.stderr**2 + (fit.slope - mean) ** 2)).sum(axis=0))
 
 
-def p_values(fit: LagFit) -> Array:
+def p_values(fit: LagFit) -> Floats:
     """Compute two-sided p-values of the slopes from Student's law: see `calibrated`."""
     mean, spread = mixture(fit)
     return np.asarray(2.0 * stdtr(fit.freedom, -np.abs(mean / spread)))
 
 
 def simulate_p_values(
-    laws: Laws, driver: Array, weight: Array, draws: int = 300, seed: int = 20
-) -> Array:
+    laws: Laws, driver: Floats, weight: Floats, draws: int = 300, seed: int = 20
+) -> Floats:
     """Simulate p-values by (draw, lag) of noise without coupling, under the weighted laws.
 
     Parameters
@@ -189,7 +188,7 @@ def simulate_p_values(
     return p_values(fit_lags(short, made.astype(np.float32), driver.astype(np.float32)))
 
 
-def calibrated(p: float, chance: Array) -> float:
+def calibrated(p: float, chance: Floats) -> float:
     """Find the share of simulated noise with at most this p-value; small ones by a power law."""
     p = max(p, 1e-300)
     values, shares, edge, power = _describe_chance(chance)
@@ -198,7 +197,7 @@ def calibrated(p: float, chance: Array) -> float:
     return float(np.interp(p, values, shares))
 
 
-def uncalibrated(share: float, chance: Array) -> float:
+def uncalibrated(share: float, chance: Floats) -> float:
     """Find the p-value below which this share of simulated noise lies: inverse of `calibrated`."""
     values, shares, edge, power = _describe_chance(chance)
     if share < edge[1]:
@@ -206,7 +205,7 @@ def uncalibrated(share: float, chance: Array) -> float:
     return float(np.interp(share, shares, values))
 
 
-def _describe_chance(chance: Array) -> tuple[Array, Array, tuple[float, float], float]:
+def _describe_chance(chance: Floats) -> tuple[Floats, Floats, tuple[float, float], float]:
     """Sort simulated p-values, with the share up to each, and fit the law of still smaller ones.
 
     The lower tail has the start and share that are returned, and Hill's exponent.
@@ -229,13 +228,13 @@ def slope_interval(
     return mean, spread, mean - reach, mean + reach
 
 
-def average_windows(block: NDArray[np.int64]) -> Any:
+def average_windows(block: Ints) -> Any:
     """Make the sparse matrix (n_blocks, n) that averages windows into blocks 0, 1, ..."""
     sizes = np.bincount(block)
     return csr_array((1.0 / sizes[block], (block, np.arange(block.size))))
 
 
-def white_covariance(mean: Any, time: Array, length: float, share: Array) -> Array:
+def white_covariance(mean: Any, time: Floats, length: float, share: Floats) -> Floats:
     """Compute the covariance of the blocks in white noise of unit variance in a full window.
 
     Parameters
@@ -256,7 +255,7 @@ def white_covariance(mean: Any, time: Array, length: float, share: Array) -> Arr
     return _average_pairs(mean, rows, columns, overlap / np.sqrt(share[rows] * share[columns]))
 
 
-def slow_covariance(mean: Any, time: Array, length: float, memory: float) -> Array:
+def slow_covariance(mean: Any, time: Floats, length: float, memory: float) -> Floats:
     r"""Compute the covariance of the blocks in an Ornstein-Uhlenbeck process of unit variance.
 
     With the autocovariance :math:`e^{-|d|/T}`, the means over two windows of length L with centres
@@ -299,7 +298,7 @@ def slow_covariance(mean: Any, time: Array, length: float, memory: float) -> Arr
     return np.asarray(distant * blocks - _average_pairs(mean, rows, columns, shared))
 
 
-def _find_overlaps(time: Array, length: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _find_overlaps(time: Floats, length: float) -> tuple[Ints, Ints]:
     """List the pairs of overlapping windows, the earlier first, each window with itself too."""
     first = np.arange(time.size)
     count = np.searchsorted(time, time + length, side="left") - first
@@ -307,9 +306,7 @@ def _find_overlaps(time: Array, length: float) -> tuple[NDArray[np.int64], NDArr
     return rows, rows + np.arange(rows.size) - np.repeat(np.cumsum(count) - count, count)
 
 
-def _average_pairs(
-    mean: Any, rows: NDArray[np.int64], columns: NDArray[np.int64], values: Array
-) -> Array:
+def _average_pairs(mean: Any, rows: Ints, columns: Ints, values: Floats) -> Floats:
     """Average a symmetric matrix, given by its upper triangle, over pairs of blocks."""
     n = mean.shape[1]
     halved = np.where(rows == columns, 0.5 * values, values)

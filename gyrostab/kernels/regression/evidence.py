@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats, Ints
 from gyrostab.kernels.compiled import KERNEL, REORDER
 
-Array = NDArray[np.float64]
 #: What is this much less likely than the best, as a logarithm, adds nothing that counts: it is
 #: taken for so likely.
 _NEGLIGIBLE = 40.0
@@ -21,8 +20,8 @@ _NEGLIGIBLE = 40.0
 
 @njit(**KERNEL)
 def _mixture_terms(
-    base: Array, rotated: Array, constant: Array, share: Array
-) -> tuple[Array, Array]:
+    base: Floats, rotated: Floats, constant: Floats, share: Floats
+) -> tuple[Floats, Floats]:
     """Compute the log terms of the mixture (design, record, width x grid) less their maximum."""
     designs, records, grid, p = rotated.shape
     kinds = constant.shape[1]
@@ -52,7 +51,7 @@ def _mixture_terms(
     return out, best
 
 
-def mixed_evidence(base: Array, rotated: Array, eigenvalues: Array, widths: Array) -> Array:
+def mixed_evidence(base: Floats, rotated: Floats, eigenvalues: Floats, widths: Floats) -> Floats:
     """Compute the log marginal likelihood of every design and record over a grid of laws.
 
     Parameters
@@ -80,7 +79,7 @@ def mixed_evidence(base: Array, rotated: Array, eigenvalues: Array, widths: Arra
 
 
 @njit(fastmath=REORDER, **KERNEL)
-def row_products(rows: Array, first: NDArray[np.int64], second: NDArray[np.int64]) -> Array:
+def row_products(rows: Floats, first: Ints, second: Ints) -> Floats:
     """Sum products of pairs of rows, ``rows[first[q]] @ rows[second[q]]``."""
     out = np.empty(first.size)
     for q in range(first.size):

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.kernels.compiled import KERNEL
 
-Array = NDArray[np.float64]
 _TINY = 1e-290
 
 
-def level_tables(low: Array, high: Array, parts: int) -> tuple[Array, Array]:
+def level_tables(low: Floats, high: Floats, parts: int) -> tuple[Floats, Floats]:
     """Compute the transition probabilities of a block of two levels.
 
     Parameters
@@ -62,8 +61,8 @@ def level_tables(low: Array, high: Array, parts: int) -> tuple[Array, Array]:
 
 @njit(**KERNEL)
 def levels_smooth(
-    like: Array, chance: Array, rises: Array, start: Array
-) -> tuple[Array, Array, Array, Array]:
+    like: Floats, chance: Floats, rises: Floats, start: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Compute the evidence of block means, and the expected share of each on the upper level.
 
     Parameters

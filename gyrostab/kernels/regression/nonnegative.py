@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-Array = NDArray[np.float64]
+from gyrostab.arrays import Floats
+
 #: Share of the square of a column that free ones leave, below which it counts as one of them. Above
 #: rounding errors.
 _MIN_APART = 1e-8
 
 
-def solve_nonnegative(normal: Array, right: Array) -> Array:
+def solve_nonnegative(normal: Floats, right: Floats) -> Floats:
     """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0``.
 
     The solution is exact: of five terms there are at most 31 subsets, and all are tried.
@@ -47,7 +47,7 @@ def solve_nonnegative(normal: Array, right: Array) -> Array:
     return np.asarray(chosen[..., 0, :] * scale)
 
 
-def solve_bounded(normal: Array, right: Array, low: Array) -> Array:
+def solve_bounded(normal: Floats, right: Floats, low: Floats) -> Floats:
     """Minimise ``s^T normal s - 2 right^T s`` over ``s >= low``.
 
     Parameters

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gyrostab.arrays import Floats
+
 _LEAST, _STEPS, _FEWEST = 0.7, 10, 8
 _DIFFERENCE = (1.0, -2.0, 1.0)
 
 
-def smooth_curve(values: Array, *, longest: float) -> Array:
+def smooth_curve(values: Floats, *, longest: float) -> Floats:
     """Remove white noise by least squares with a penalty on squared second differences.
 
     The penalty minimises the generalised cross-validation, so that a curve with little noise is

@@ -11,18 +11,17 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Floats
 from gyrostab.kernels.compiled import INNER, KERNEL
 
-Array = NDArray[np.float64]
 #: Ratio of neighbouring correlation times in `flicker_states`.
 RATIO = 4.0
 #: Longest correlation time, in lengths of the record: slower parts are a constant in it.
 LONGEST = 4.0
 
 
-def flicker_states(step: float, span: float) -> tuple[Array, Array, float]:
+def flicker_states(step: float, span: float) -> tuple[Floats, Floats, float]:
     """Approximate flicker noise with B = 1 by Ornstein-Uhlenbeck processes, up to a constant.
 
     Parameters
@@ -124,15 +123,15 @@ def _scale_innovations(row, state, weight, decay, gain, scale, out):  # type: ig
 
 @njit(**KERNEL)
 def whiten(
-    columns: Array,
-    variance: Array,
-    step_seconds: Array,
-    present: NDArray[np.bool_],
-    K2: Array,
-    ou_variance: Array,
-    ou_time: Array,
+    columns: Floats,
+    variance: Floats,
+    step_seconds: Floats,
+    present: Bools,
+    K2: Floats,
+    ou_variance: Floats,
+    ou_time: Floats,
     angle: float = 0.0,
-) -> tuple[Array, float]:
+) -> tuple[Floats, float]:
     """Whiten columns of block means by the covariance V of their noise, with the constant removed.
 
     Products of whitened columns a, b are ``a' W b`` with ``W = V^-1 - V^-1 1 (1' V^-1 1)^-1 1'

@@ -6,22 +6,22 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gyrostab.arrays import Floats
+
 # ordinates that are computed one by one; above, the ratio to the plain spectrum is interpolated
 _EXACT = 48
 _SPARSE = 48
 
 
-def _second_difference(integral: Array) -> Array:
+def _second_difference(integral: Floats) -> Floats:
     """``F(l + 1) - 2 F(l) + F(l - 1)`` for an even F given at 0, 1, 2, ..."""
     return np.concatenate(
         [[2.0 * (integral[1] - integral[0])], integral[2:] - 2.0 * integral[1:-1] + integral[:-2]]
     )
 
 
-def sample_covariance(size: int, rate: float) -> Array:
+def sample_covariance(size: int, rate: float) -> Floats:
     """Compute the covariance of samples l apart for unit Q, N, B and K, as means over intervals.
 
     That of B and K is defined up to a constant, on which no block statistic depends.
@@ -53,7 +53,7 @@ def sample_covariance(size: int, rate: float) -> Array:
     return out
 
 
-def _plain_spectra(frequency: Array, rate: float) -> Array:
+def _plain_spectra(frequency: Floats, rate: float) -> Floats:
     """Compute plain two-sided densities of the four terms, shape (4, frequency).
 
     For unit strength, without averaging over the samples: only the shape that is interpolated. The
@@ -70,7 +70,7 @@ def _plain_spectra(frequency: Array, rate: float) -> Array:
     )
 
 
-def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
+def expected_powers(weights: Floats, rate: float, ordinates: int) -> Floats:
     """Compute the expected periodogram of a full block for unit strength of each term, two-sided.
 
     Parameters
@@ -105,7 +105,7 @@ def expected_powers(weights: Array, rate: float, ordinates: int) -> Array:
     return np.asarray(powers / powers[1])
 
 
-def interval_variance(ratio: Array) -> Array:
+def interval_variance(ratio: Floats) -> Floats:
     """Compute the variance of the mean of a unit exponentially correlated process over an interval.
 
     Parameters
@@ -123,7 +123,7 @@ def interval_variance(ratio: Array) -> Array:
     return np.where(ratio > 1e-3, law, 1.0 - ratio / 3.0 + ratio**2 / 12.0)
 
 
-def correlated_powers(weights: Array, rate: float, ordinates: int, time: float) -> Array:
+def correlated_powers(weights: Floats, rate: float, ordinates: int, time: float) -> Floats:
     """Compute the expected periodogram of an exponentially correlated process.
 
     Parameters
@@ -153,7 +153,7 @@ def correlated_powers(weights: Array, rate: float, ordinates: int, time: float) 
     white = np.zeros(weights.size)
     white[0] = rate
 
-    def plain(frequency: Array) -> Array:
+    def plain(frequency: Floats) -> Floats:
         bend = 2.0 * np.sin(math.pi * frequency / rate)
         return np.stack([np.ones_like(frequency), 1.0 / (step**2 + bend**2)])
 
@@ -164,12 +164,12 @@ def correlated_powers(weights: Array, rate: float, ordinates: int, time: float) 
 
 
 def _tapered_powers(
-    covariance: Array,
-    weights: Array,
+    covariance: Floats,
+    weights: Floats,
     ordinates: int,
-    plain: Callable[[Array], Array],
+    plain: Callable[[Floats], Floats],
     rate: float,
-) -> Array:
+) -> Floats:
     """Compute expected periodograms (row, ordinate) of covariances (row, size), up to a factor.
 
     Between the ordinates that are computed one by one, the ratio to `plain` spectra (row, ...) is

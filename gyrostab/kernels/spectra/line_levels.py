@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from gyrostab.arrays import Array
+
 #: Lines on each side that a steady line leaks into; of the taper.
 LEAK_LINES = 3
 #: Lowest lines, without lines below them.

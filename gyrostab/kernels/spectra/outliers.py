@@ -13,11 +13,9 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.kernels.compiled import INNER, KERNEL
-
-Array = NDArray[np.float64]
 
 #: Bins of the histogram of departures: one for zero, then four an octave from 2**-32 to 2**32.
 HISTOGRAM = 256
@@ -38,7 +36,7 @@ def _bin_index(value):  # type: ignore[no-untyped-def]
     return np.int64(min(max(4.0 * math.log2(value) + 128.0, 1.0), 255.0))
 
 
-def histogram_edge(number: Any) -> Array:
+def histogram_edge(number: Any) -> Floats:
     """Lower edge of bin `number` of the histogram of departures; fractions of a bin are allowed."""
     return np.asarray(np.exp2((np.asarray(number, np.float64) - 128.0) / 4.0))
 

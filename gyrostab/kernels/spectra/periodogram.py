@@ -19,17 +19,15 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Bools, Complexes, Floats, Ints
 from gyrostab.kernels.compiled import INNER, KERNEL
-
-Array = NDArray[np.float64]
 
 _EXACT = 12  # ordinates of a band up to which the covariance of each pair is summed
 _APART = 16  # ordinates that the taper still correlates
 
 
-def taper(size: int, share: float = 0.2) -> Array:
+def taper(size: int, share: float = 0.2) -> Floats:
     """Make Tukey's taper: cosine slopes on `share` of the samples, half at either end.
 
     Examples
@@ -49,7 +47,7 @@ def ordinates(size: int) -> int:
     return (size + 1) // 2 - 1
 
 
-def band_edges(size: int, bands: int = 16) -> NDArray[np.int64]:
+def band_edges(size: int, bands: int = 16) -> Ints:
     """Divide the ordinates into about `bands` bands, evenly spaced in log frequency.
 
     Examples
@@ -183,9 +181,7 @@ def block_samples(x, centred, moments, counts):  # type: ignore[no-untyped-def]
             moments[b, :] = np.nan
 
 
-def gap_spectra(
-    present: NDArray[np.bool_], weights: Array
-) -> tuple[Array, NDArray[np.complex128], NDArray[np.complex128]]:
+def gap_spectra(present: Bools, weights: Floats) -> tuple[Floats, Complexes, Complexes]:
     """Compute the expected power of each ordinate in white noise, and the spectra of the mask.
 
     Parameters
@@ -267,7 +263,7 @@ def shape_of_bands(mask, squared, expected, present, edges, size):  # type: igno
     return out
 
 
-def band_covariance(size: int) -> Array:
+def band_covariance(size: int) -> Floats:
     """Compute the relative covariance of band powers of a whole block in white noise (band, band).
 
     The taper spreads each ordinate over its neighbours, so that adjacent bands share a few percent

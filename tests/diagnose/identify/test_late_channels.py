@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify import late_channels
 from gyrostab.diagnose.identify.examination import Identifications, prepare_examination
 from gyrostab.diagnose.identify.late_channels import (
-    Array,
     DelaySearch,
     chance_of_best,
     find_late_channel,
@@ -134,12 +134,12 @@ def test_late_channel_explains_more_than_all_else(
     """The evidence of each delay is given."""
 
     class GivenEvidence(DelaySearch):
-        def parts(self, channel: str) -> Array:
+        def parts(self, channel: str) -> Floats:
             return np.random.default_rng(4).standard_normal(90 * 16)
 
         def evidence(
-            self, channel: str, parts: Array, shifts: Iterable[int], *, wrap: bool = False
-        ) -> Array:
+            self, channel: str, parts: Floats, shifts: Iterable[int], *, wrap: bool = False
+        ) -> Floats:
             peak = np.maximum(best - np.abs(np.array(list(shifts)) - 48.0), 0.0)
             peak[np.array(list(shifts)) == 0] = on_time
             return np.full(peak.size, elsewhere) if wrap else peak

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.folds import FOLDS
 from gyrostab.diagnose.predict.candidates import Candidate, Variant
 from gyrostab.diagnose.predict.search import collect_evidence
@@ -17,7 +17,7 @@ VARIANTS = 100
 AXES = [("x",), ("y",)]
 
 
-def evidence_of_peaks(peaks: Sequence[tuple[int, float]]) -> tuple[NDArray[np.float64], list[int]]:
+def evidence_of_peaks(peaks: Sequence[tuple[int, float]]) -> tuple[Floats, list[int]]:
     """Evidence on each axis, and best variants; one variant of an axis has this log factor."""
     variants = tuple(
         Variant({"at": float(instant)}, ("step",), np.empty(0)) for instant in range(VARIANTS)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.zero_bin import empty_zone
@@ -18,14 +18,14 @@ SIZE = 24_000
 WIDTH = 0.45
 
 
-def sweep(seed: int) -> NDArray[np.float64]:
+def sweep(seed: int) -> Floats:
     """Noise of 0.5 deg/h about a rate that swings through zero three times."""
     rng = np.random.default_rng(seed)
     turns = 2.0 * np.pi * 3.0 * np.arange(SIZE) / SIZE
     return 1.5 * np.sin(turns + seed) + 0.5 * rng.standard_normal(SIZE)
 
 
-def estimate_width(values: NDArray[np.float64]) -> tuple[float, ...]:
+def estimate_width(values: Floats) -> tuple[float, ...]:
     log = make_log(values[None], rate=20.0, unit="deg/h", start="2026-01-01")
     return estimate_from_counts(
         "dead_zone", "stuck", "x", reduce_log(log), CountEvidence({}), DEFAULTS

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
 import gyrostab
+from gyrostab.arrays import Floats
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.sample_counts import hidden_by_grid
 from gyrostab.diagnose.nulls.records import null_records
@@ -22,7 +22,7 @@ SIZE = 24_000
 COUNTS = ("repeats", "zeros", "stuck", "filled")
 
 
-def noise(kind: str, *, seed: int = 3, size: int = SIZE) -> NDArray[np.float64]:
+def noise(kind: str, *, seed: int = 3, size: int = SIZE) -> Floats:
     """White noise, low-passed noise, differences of an angle, or noise of two levels."""
     rng = np.random.default_rng(seed)
     white = rng.standard_normal(size)
@@ -35,7 +35,7 @@ def noise(kind: str, *, seed: int = 3, size: int = SIZE) -> NDArray[np.float64]:
     return np.asarray(values / values.std() + 0.13)
 
 
-def log_of(values: NDArray[np.float64]) -> xr.Dataset:
+def log_of(values: Floats) -> xr.Dataset:
     return make_log(values[None], rate=50.0, unit="deg/h", start="2026-01-01")
 
 
@@ -73,7 +73,7 @@ def test_fine_step_is_found_in_a_short_record(step: float):
     assert quantization_step(3600.0 * values + 0.7) == pytest.approx(3600.0 * step, rel=1e-6)
 
 
-def turning(seed: int, *, size: int = SIZE) -> NDArray[np.float64]:
+def turning(seed: int, *, size: int = SIZE) -> Floats:
     """Noise of an axis that turns at up to 30 deg/s, on a grid of 1e-6 deg/s [degree hour-1]."""
     rng = np.random.default_rng(seed)
     stops = np.repeat(rng.choice([-30.0, -10.0, 0.0, 10.0, 30.0], size // 2000), 2000)
