@@ -98,25 +98,14 @@ def window_channels(
     return out
 
 
-def _fit_trends(
-    values: Any,
-    stamps: Ints | None,
-    rate: float,
-    a: Ints,
-    b: Ints,
-) -> Floats:
+def _fit_trends(values: Any, stamps: Ints | None, rate: float, a: Ints, b: Ints) -> Floats:
     data = np.ascontiguousarray(fill_masked(values), dtype=np.float64)
     seconds = np.arange(data.size) / rate if stamps is None else (stamps - stamps[:1]) / 1e9
     return np.asarray(window_trend(data, seconds, a, b))
 
 
 def _find_trends(
-    data: Any,
-    stamps: Ints | None,
-    rate: float,
-    bounds: Sequence[Ints],
-    *,
-    lazy: bool,
+    data: Any, stamps: Ints | None, rate: float, bounds: Sequence[Ints], *, lazy: bool
 ) -> Any:
     """Compute mean and slope of the windows of each group, with these `bounds` (2, n)."""
     lazy = lazy and isinstance(data, da.Array)

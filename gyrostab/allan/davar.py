@@ -184,11 +184,7 @@ def _warn_unusable_channels(log: xr.Dataset) -> None:
 
 
 def davar_part(
-    log: xr.Dataset,
-    *,
-    part: slice,
-    space: Workspace | None = None,
-    **options: Any,
+    log: xr.Dataset, *, part: slice, space: Workspace | None = None, **options: Any
 ) -> xr.Dataset:
     """Compute some windows of the surface of `davar`, immediately and in the calling thread.
 
@@ -269,11 +265,7 @@ def _attach_labels(
     )
     centre = bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) // 2
     variables: dict[str, Any] = {
-        name: (
-            cube,
-            values,
-            attributes(name, variance=VARIANCES[unit.variance].text),
-        )
+        name: (cube, values, attributes(name, variance=VARIANCES[unit.variance].text))
         for name, values in zip(CELL_FIELDS, cells, strict=True)
     }
     # In addition to the responses, the fit needs the share of degrees of freedom left by the gaps.

@@ -44,10 +44,7 @@ def term_bits(terms: Iterable[str]) -> int:
 
 
 def check_fit_options(
-    terms: str | Iterable[str] = "QNBKR",
-    tau_min: Any = None,
-    tau_max: Any = None,
-    **other: Any,
+    terms: str | Iterable[str] = "QNBKR", tau_min: Any = None, tau_max: Any = None, **other: Any
 ) -> tuple[list[str], float, float]:
     """Check options of `fit_noise` as far as they do not depend on the surface; ignore others.
 

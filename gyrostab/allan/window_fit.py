@@ -250,12 +250,7 @@ def _solve_bounds(field: dict[str, Floats], estimate: str, law: str, *scores: fl
     return np.asarray(bounds.reshape(len(scores), *parts[0].shape))
 
 
-def _limit_of_curve(
-    flat: list[Floats],
-    square: Floats,
-    dof: Floats,
-    tables: FitTables,
-) -> Floats:
+def _limit_of_curve(flat: list[Floats], square: Floats, dof: Floats, tables: FitTables) -> Floats:
     """Find the 95 % upper limit of a squared coefficient without assuming the five-term model.
 
     The part of a term cannot exceed the whole curve, because anything else in a cell, noise or not,

@@ -231,8 +231,7 @@ def describe_error(error: Exception) -> int:
         return print_error(f"{error.filename}: {error.strerror}", 2)
     if isinstance(error, MemoryError):
         return print_error(
-            f"out of memory ({error}); use fewer --taus, a longer --step, or fewer --workers",
-            1,
+            f"out of memory ({error}); use fewer --taus, a longer --step, or fewer --workers", 1
         )
     return print_error(
         f"unexpected {type(error).__name__}: {error}. "

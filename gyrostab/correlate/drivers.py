@@ -40,10 +40,7 @@ class Driver:
 
 
 def align_drivers(
-    product: xr.Dataset,
-    channels: Sequence[str | xr.DataArray],
-    lags: Ints,
-    step: float,
+    product: xr.Dataset, channels: Sequence[str | xr.DataArray], lags: Ints, step: float
 ) -> list[Driver]:
     """Average channels over the windows, for every lag.
 

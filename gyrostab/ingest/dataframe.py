@@ -12,12 +12,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyrostab.errors import (
-    GyrostabError,
-    MissingUnitError,
-    SchemaError,
-    TimeError,
-)
+from gyrostab.errors import GyrostabError, MissingUnitError, SchemaError, TimeError
 from gyrostab.ingest.combine import warn_notes
 from gyrostab.schema import texts
 

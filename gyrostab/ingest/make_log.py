@@ -91,10 +91,7 @@ def make_log(
         data = data * parsed.factor
     check_span(stamp_ns(start), rate, data.shape[1], "make_log")
     coordinates = time_coordinate(stamp_ns(start), rate, data.shape[1])
-    attrs = {
-        "units": SIGNAL_UNITS[kind],
-        "long_name": SIGNAL_LONG_NAMES[kind],
-    }
+    attrs = {"units": SIGNAL_UNITS[kind], "long_name": SIGNAL_LONG_NAMES[kind]}
     log = xr.Dataset(
         {kind: (("axis", "time"), data, attrs, packing)},
         coords=coordinates,

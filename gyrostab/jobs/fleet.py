@@ -24,13 +24,7 @@ import pandas as pd
 
 from gyrostab.errors import FormatError, GyrostabError, WorkerError
 from gyrostab.io.opening import open_dataset
-from gyrostab.jobs.archive import (
-    LogRun,
-    find_archive,
-    find_runs,
-    index_files,
-    is_fleet,
-)
+from gyrostab.jobs.archive import LogRun, find_archive, find_runs, index_files, is_fleet
 from gyrostab.jobs.fleet_output import (
     PLOTLY_FILE,
     REQUESTS,
@@ -68,11 +62,7 @@ from gyrostab.jobs.load import check_options
 from gyrostab.jobs.run import find_job_name, read_job_name, run
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
 from gyrostab.progress import Stage, no_stage
-from gyrostab.store.output import (
-    check_output,
-    protect_inputs,
-    resolve_link,
-)
+from gyrostab.store.output import check_output, protect_inputs, resolve_link
 from gyrostab.store.remote import (
     exists,
     find_url,

@@ -12,14 +12,7 @@ import pandas as pd
 import xarray as xr
 
 from gyrostab.io.opening import open_dataset
-from gyrostab.jobs.archive import (
-    DIAGNOSIS,
-    Archive,
-    LogRun,
-    find_archive,
-    is_fleet,
-    read_diagnosis,
-)
+from gyrostab.jobs.archive import DIAGNOSIS, Archive, LogRun, find_archive, is_fleet, read_diagnosis
 from gyrostab.noise import LAWS
 from gyrostab.schema import escape_text, texts
 from gyrostab.store.output import new_output

@@ -16,12 +16,7 @@ import xarray as xr
 from gyrostab.errors import FormatError, GyrostabError, OutputError, ResumeError
 from gyrostab.io.datasets import to_netcdf, to_zarr
 from gyrostab.jobs.checkpoint import assemble, find_blocks
-from gyrostab.jobs.engine import (
-    Blocks,
-    compute_blocks,
-    compute_part,
-    find_record_bands,
-)
+from gyrostab.jobs.engine import Blocks, compute_blocks, compute_part, find_record_bands
 from gyrostab.jobs.job import (
     begin_job,
     check_job_folder,

@@ -12,13 +12,7 @@ import numpy as np
 from gyrostab.arrays import Floats
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import Chunk, Effect, Prediction, Setup, Windows, parameter
-from gyrostab.physics.phase import (
-    TURN,
-    fold,
-    turn_means,
-    turn_means_of_windows,
-    turns_of_samples,
-)
+from gyrostab.physics.phase import TURN, fold, turn_means, turn_means_of_windows, turns_of_samples
 from gyrostab.units import INNER
 
 

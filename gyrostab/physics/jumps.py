@@ -10,15 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from gyrostab.arrays import Floats
-from gyrostab.physics.base import (
-    Chunk,
-    Effect,
-    Likeness,
-    Prediction,
-    Setup,
-    Windows,
-    parameter,
-)
+from gyrostab.physics.base import Chunk, Effect, Likeness, Prediction, Setup, Windows, parameter
 from gyrostab.physics.phase import lorentz_density
 from gyrostab.units import HOUR
 

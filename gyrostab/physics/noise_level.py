@@ -17,15 +17,7 @@ import numpy as np
 from gyrostab.arrays import Floats
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import sampled_psd
-from gyrostab.physics.base import (
-    Chunk,
-    Effect,
-    Likeness,
-    Prediction,
-    Setup,
-    Windows,
-    parameter,
-)
+from gyrostab.physics.base import Chunk, Effect, Likeness, Prediction, Setup, Windows, parameter
 from gyrostab.units import HOUR, INNER
 
 #: Least N^2 of a polynomial law, as a share of its value at the reference (a tenth of N). Outside
@@ -106,9 +98,7 @@ class TemperatureNoise(Effect):
         """
         at = drivers["temperature"]
         return replace(
-            self,
-            reference=at,
-            linear=self.linear + 2.0 * self.quadratic * (at - self.reference),
+            self, reference=at, linear=self.linear + 2.0 * self.quadratic * (at - self.reference)
         )
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Floats], Any]:

@@ -12,10 +12,7 @@ import numpy as np
 from gyrostab.arrays import Floats
 from gyrostab.errors import SchemaError
 from gyrostab.physics.base import Chunk, Effect, Prediction, Setup, Windows, parameter
-from gyrostab.physics.phase import (
-    fold,
-    resonance_density,
-)
+from gyrostab.physics.phase import fold, resonance_density
 from gyrostab.units import HOUR, INNER
 
 _PPM = 1e-6

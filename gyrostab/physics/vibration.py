@@ -10,15 +10,7 @@ import numpy as np
 
 from gyrostab.arrays import Floats
 from gyrostab.errors import OptionError
-from gyrostab.physics.base import (
-    Chunk,
-    Effect,
-    Likeness,
-    Prediction,
-    Setup,
-    Windows,
-    parameter,
-)
+from gyrostab.physics.base import Chunk, Effect, Likeness, Prediction, Setup, Windows, parameter
 from gyrostab.units import INNER
 
 _MIN_EDGE_HZ = 0.01

@@ -180,11 +180,7 @@ def fitted_curves(product: xr.Dataset) -> tuple[Floats, Floats]:
 
 
 def _draw_terms(
-    panel: Axes,
-    window: xr.Dataset,
-    terms: Floats,
-    total: Floats,
-    colours: list[str],
+    panel: Axes, window: xr.Dataset, terms: Floats, total: Floats, colours: list[str]
 ) -> None:
     """Draw the fitted curve in black and observed terms dashed; list limits in the legend."""
     tau = window["tau"].values

@@ -136,13 +136,7 @@ def plot_davar(
     time_axis(panels[-1], time_edges)
     figure.align_ylabels(panels)
     bar = figure.colorbar(
-        mesh,
-        ax=panels,
-        label=label,
-        extend="both",
-        fraction=0.08,
-        pad=0.01,
-        aspect=12 * len(names),
+        mesh, ax=panels, label=label, extend="both", fraction=0.08, pad=0.01, aspect=12 * len(names)
     )
     _label_colours(bar, relative=relative)
     return figure
@@ -150,11 +144,7 @@ def plot_davar(
 
 @draws_figure
 def plot_davar_3d(
-    product: xr.Dataset,
-    *,
-    axis: str | None = None,
-    columns: int = 120,
-    width: float = PAGE_MM,
+    product: xr.Dataset, *, axis: str | None = None, columns: int = 120, width: float = PAGE_MM
 ) -> Figure:
     """Draw the Allan deviation of one axis as a surface over time and log averaging time.
 

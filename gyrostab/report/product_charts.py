@@ -268,10 +268,7 @@ def _log_deviation(product: xr.Dataset) -> Floats:
 
 def _draw_map(product: xr.Dataset, gaps: list[dict[str, Any]]) -> go.Figure:
     figure = new_chart(
-        xaxis=TIME_AXIS,
-        yaxis=log_axis(TAU_LABEL, product["tau"].values),
-        height=380,
-        shapes=gaps,
+        xaxis=TIME_AXIS, yaxis=log_axis(TAU_LABEL, product["tau"].values), height=380, shapes=gaps
     )
     values = _log_deviation(product)
     figure.add_heatmap(

@@ -69,11 +69,7 @@ class BlockState:
 
 
 def next_block(
-    plan: Plan,
-    state: BlockState,
-    first: int,
-    count: int,
-    units: Sequence[Units],
+    plan: Plan, state: BlockState, first: int, count: int, units: Sequence[Units]
 ) -> tuple[Floats, BlockState]:
     """Make the samples ``first`` to ``first + count`` of a log.
 

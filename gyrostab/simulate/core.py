@@ -148,11 +148,7 @@ def simulate(
         ]
         state = _begin_states(plan, frame.seed)
     data = lazy_rates(
-        plan,
-        state,
-        starts,
-        frame.size,
-        chunk=chunk or max(1, BLOCK // frame.oversampling),
+        plan, state, starts, frame.size, chunk=chunk or max(1, BLOCK // frame.oversampling)
     )
     if like is not None:
         import dask.array as da
@@ -207,11 +203,7 @@ def _convert_units(effect: Effect, environment: xr.Dataset, present: list[str]) 
 
 
 def _make_plan(
-    model: Model,
-    frame: Frame,
-    environment: xr.Dataset,
-    tables: GapTables,
-    like: xr.Dataset | None,
+    model: Model, frame: Frame, environment: xr.Dataset, tables: GapTables, like: xr.Dataset | None
 ) -> Plan:
     present = log_channels(environment)
     for name in model.delay:

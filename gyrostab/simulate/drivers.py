@@ -43,11 +43,7 @@ class Source:
     size: int = 0  # number of its values
 
     def at(
-        self,
-        instants: Ints,
-        carry: float | None = None,
-        *,
-        before: int | None = None,
+        self, instants: Ints, carry: float | None = None, *, before: int | None = None
     ) -> tuple[Floats, float | None]:
         """Interpolate at increasing `instants` [ns since 1970].
 

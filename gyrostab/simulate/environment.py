@@ -199,12 +199,7 @@ def chamber(
     ends = np.where(np.arange(count) % 2 == (first == "high"), low, high)
     table = np.stack([np.stack([begin, begin + wait], axis=1).ravel(), np.repeat(ends, 2)], axis=1)
     return _make_temperature(
-        channel,
-        piecewise(table, held=False),
-        seconds,
-        start,
-        sensor_rate,
-        _to_seconds(lag),
+        channel, piecewise(table, held=False), seconds, start, sensor_rate, _to_seconds(lag)
     )
 
 

@@ -26,17 +26,10 @@ from gyrostab.schema import (
     check_surface,
     with_axis,
 )
-from gyrostab.store.attributes import (
-    decode_attributes,
-    encode_attributes,
-    make_global_attributes,
-)
+from gyrostab.store.attributes import decode_attributes, encode_attributes, make_global_attributes
 from gyrostab.store.lazy import transpose_lazy
 from gyrostab.store.private import close_function, is_in_memory
-from gyrostab.store.safe_names import (
-    make_names_storable,
-    restore_names,
-)
+from gyrostab.store.safe_names import make_names_storable, restore_names
 from gyrostab.store.times import (
     decode_stamps,
     encode_all_stamps,
@@ -188,9 +181,7 @@ def from_disk(stored: xr.Dataset, where: str) -> xr.Dataset:
             stored.variables[name].attrs.get("axis_attributes", "{}")
         )
     dataset = xr.Dataset(
-        variables,
-        xr.Coordinates(coords, indexes=indexes),
-        decode_attributes(dict(stored.attrs)),
+        variables, xr.Coordinates(coords, indexes=indexes), decode_attributes(dict(stored.attrs))
     )
     dataset = restore_names(dataset)
     dataset.set_close(close)

@@ -86,10 +86,7 @@ def _open_remote(path: Path, url: str) -> xr.Dataset:
 
 
 def _open_dataset(
-    path: Path,
-    *,
-    strict: bool,
-    check: Callable[[Path, Mapping[Any, xr.Variable]], None] | None,
+    path: Path, *, strict: bool, check: Callable[[Path, Mapping[Any, xr.Variable]], None] | None
 ) -> xr.Dataset:
     if path.is_file():
         check_global_heaps(path)

@@ -35,12 +35,7 @@ def shupe(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> E
     form = f"diffusion through {layers} layers, slowest mode {slowest:.0f} s"
     shares = draw_shares(rng)
     effect = make_mean_effect(
-        scenario,
-        shape,
-        shares,
-        strength=strength,
-        form=form,
-        form_differs=True,
+        scenario, shape, shares, strength=strength, form=form, form_differs=True
     )
     # steady response to 1 K/min over the largest value
     steady = float(weights.sum()) / 60.0 / float(np.abs(shape).max())
@@ -162,12 +157,7 @@ def _make_light_noise(
         return np.asarray(instrument.relative_psd(power * 10 ** (-drop / 10), **budget) / nominal)
 
     effect, _ = make_variance_effect(
-        scenario,
-        ratio,
-        strength=strength,
-        axes=axes_with_share(shares),
-        first=1e-4,
-        **description,
+        scenario, ratio, strength=strength, axes=axes_with_share(shares), first=1e-4, **description
     )
     return effect
 

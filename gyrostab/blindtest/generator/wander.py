@@ -9,11 +9,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from gyrostab.arrays import Floats
-from gyrostab.blindtest.generator.detection_limits import (
-    NATS,
-    amplitude_for,
-    learned_random_nats,
-)
+from gyrostab.blindtest.generator.detection_limits import NATS, amplitude_for, learned_random_nats
 from gyrostab.blindtest.generator.noise import floor_psd
 from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
 from gyrostab.blindtest.generator.shapes import axes_with_share, draw_shares, make_mean_effect

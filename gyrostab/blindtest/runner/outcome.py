@@ -349,9 +349,5 @@ def _format_list(lines: Sequence[str], none: str = "none") -> str:
 def _wrap_text(text: str, *, indent: str = "") -> str:
     """Wrap a line of Markdown."""
     return textwrap.fill(
-        text,
-        _COLUMNS,
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
+        text, _COLUMNS, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
     )

@@ -91,11 +91,7 @@ def log_allan(values: Floats) -> Floats:
 
 
 def _draw_null(
-    rng: np.random.Generator,
-    missing: Bools,
-    noise: dict[str, float],
-    rate: float,
-    flicker: str,
+    rng: np.random.Generator, missing: Bools, noise: dict[str, float], rate: float, flicker: str
 ) -> Floats:
     size = missing.size
     record = floor.white_level(noise["N"]) * math.sqrt(rate) * rng.standard_normal(size) + 7.0
@@ -306,11 +302,7 @@ def trace_visibility(scenario: Scenario, effect: Effect) -> dict[str, float]:
 
 
 def find_visibility(
-    scenario: Scenario,
-    effects: Sequence[Effect],
-    record: Floats,
-    *,
-    rng: np.random.Generator,
+    scenario: Scenario, effects: Sequence[Effect], record: Floats, *, rng: np.random.Generator
 ) -> dict[str, Any]:
     """Test whether the effects of a record (axis, time) are sub-threshold.
 

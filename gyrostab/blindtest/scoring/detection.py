@@ -29,9 +29,7 @@ _GROUPS = {
 _NAMED_STRENGTH, _STRENGTH_TOLERANCE = 5.0, 1e-3
 
 
-def _list_comparisons(
-    rows: Sequence[Row],
-) -> list[tuple[dict[str, Any], list[Row], Floats, Bools]]:
+def _list_comparisons(rows: Sequence[Row]) -> list[tuple[dict[str, Any], list[Row], Floats, Bools]]:
     """List group and detector, records of noise and cases, their scores, and which are cases."""
     noise = answered_rows([row for row in rows if row["kind"] in ("null", "counterpart")])
     out = []

@@ -11,12 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from gyrostab.arrays import Floats
-from gyrostab.blindtest.scoring.proportions import (
-    Line,
-    make_line,
-    resample,
-    share_interval,
-)
+from gyrostab.blindtest.scoring.proportions import Line, make_line, resample, share_interval
 from gyrostab.blindtest.scoring.score import drawn_rows, first_rows
 
 Row = Mapping[str, Any]

@@ -61,11 +61,7 @@ def _whiten_differences(columns: Floats, variance: Floats, walk: Floats) -> tupl
 
 
 def _gain_of_terms(
-    series: Floats,
-    counts: Ints,
-    terms: Floats,
-    costs: Floats,
-    walk_ratios: Sequence[float],
+    series: Floats, counts: Ints, terms: Floats, costs: Floats, walk_ratios: Sequence[float]
 ) -> float:
     """Compute the largest gain in log likelihood, less the cost, of one to `_MAX_TERMS` terms.
 

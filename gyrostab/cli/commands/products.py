@@ -14,12 +14,7 @@ from gyrostab.errors import OptionError
 
 @app.command(sort_key=6, help_epilogue="")
 def report(
-    product: Product,
-    /,
-    *,
-    output: Output,
-    log: Path | None = None,
-    common: Common = Common(),
+    product: Product, /, *, output: Output, log: Path | None = None, common: Common = Common()
 ) -> None:
     """Write a self-contained HTML report of a product or a diagnosis, with figures.
 

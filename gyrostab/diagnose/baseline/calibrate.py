@@ -163,11 +163,7 @@ def calibrate_noise(
 
 
 def calibrate_on_known(
-    blocks: xr.Dataset,
-    baseline: xr.Dataset,
-    known: Bools,
-    *,
-    settings: Settings = DEFAULTS,
+    blocks: xr.Dataset, baseline: xr.Dataset, known: Bools, *, settings: Settings = DEFAULTS
 ) -> xr.Dataset:
     """Calibrate the noise again on those quiescent blocks of a baseline that are known (block,).
 

@@ -22,9 +22,7 @@ from scipy.optimize import OptimizeResult
 
 from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.diagnose.baseline.axis_means import AxisMeans, find_peaks
-from gyrostab.diagnose.baseline.expected_statistics import (
-    reduced_shape,
-)
+from gyrostab.diagnose.baseline.expected_statistics import reduced_shape
 from gyrostab.diagnose.baseline.posterior import (
     Fit,
     average_groups,
@@ -33,10 +31,7 @@ from gyrostab.diagnose.baseline.posterior import (
     with_floor,
 )
 from gyrostab.diagnose.evidence.held_out import mean_residual
-from gyrostab.diagnose.evidence.wandering import (
-    add_correlated,
-    expected_processes,
-)
+from gyrostab.diagnose.evidence.wandering import add_correlated, expected_processes
 from gyrostab.diagnose.predict.condition import fit_powers
 from gyrostab.diagnose.predict.linear_model import (
     State,

@@ -135,11 +135,7 @@ def _describe_lines(baseline: xr.Dataset, blocks: xr.Dataset, square: Floats) ->
 
 
 def scale_to_quiescent(
-    blocks: xr.Dataset,
-    posteriors: list[Posterior],
-    noise: Floats,
-    added: Floats,
-    quiet: Bools,
+    blocks: xr.Dataset, posteriors: list[Posterior], noise: Floats, added: Floats, quiet: Bools
 ) -> tuple[list[Posterior], Floats]:
     """Scale the noise of a simulation to its level in quiescent blocks of the recording; say so.
 

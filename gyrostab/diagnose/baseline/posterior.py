@@ -81,12 +81,7 @@ def average_blocks(power: Floats, shape: Floats, columns: Floats) -> Fit:
 
 
 def average_groups(
-    power: Floats,
-    shape: Floats,
-    columns: Floats,
-    level: Floats,
-    chosen: Bools,
-    count: int,
+    power: Floats, shape: Floats, columns: Floats, level: Floats, chosen: Bools, count: int
 ) -> Fit:
     """Average the chosen blocks in at most so many groups of similar level (block,)."""
     order = np.argsort(np.where(chosen, level, np.inf), kind="stable")[: int(chosen.sum())]
@@ -365,13 +360,5 @@ def noise_posterior(
         squares = _draw_positive(square, information, rng)
     squares[:, 1] = np.maximum(squares[:, 1], 0.01 * square[1])
     return Posterior(
-        square,
-        error,
-        K,
-        B,
-        weight,
-        squares,
-        slow_draws,
-        joined,
-        angle=float(means.wander.angle),
+        square, error, K, B, weight, squares, slow_draws, joined, angle=float(means.wander.angle)
     )

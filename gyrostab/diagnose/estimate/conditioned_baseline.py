@@ -138,10 +138,7 @@ def expected_baseline(
 
 
 def without_expected(
-    blocks: xr.Dataset,
-    baseline: xr.Dataset,
-    expected: Sequence[Selection],
-    settings: Settings,
+    blocks: xr.Dataset, baseline: xr.Dataset, expected: Sequence[Selection], settings: Settings
 ) -> xr.Dataset:
     """Drop the blocks in which expected effects leave anomalous samples or move the rate."""
     if not expected:

@@ -9,24 +9,11 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from gyrostab.arrays import Floats
-from gyrostab.diagnose.baseline.expected_statistics import (
-    band_columns,
-    reduced_shape,
-)
-from gyrostab.diagnose.baseline.posterior import (
-    Fit,
-    average_blocks,
-    choose_filter,
-    fit_behind,
-)
+from gyrostab.diagnose.baseline.expected_statistics import band_columns, reduced_shape
+from gyrostab.diagnose.baseline.posterior import Fit, average_blocks, choose_filter, fit_behind
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.filter_response import band_response
-from gyrostab.diagnose.predict.linear_model import (
-    State,
-    band_widths,
-    stack_columns,
-    unspread_share,
-)
+from gyrostab.diagnose.predict.linear_model import State, band_widths, stack_columns, unspread_share
 from gyrostab.diagnose.settings import INTERVAL_TAILS
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.registry import effects

@@ -97,9 +97,7 @@ def fit_identifications(identifications: Identifications, baseline: xr.Dataset) 
         fitted
         for identification in identifications.identified
         for fitted in _fit_identification(
-            identification,
-            identifications.state_without(identification, baseline),
-            identifications,
+            identification, identifications.state_without(identification, baseline), identifications
         )
     ]
 

@@ -273,11 +273,7 @@ def _effect_power(effect: Effect, blocks: xr.Dataset, axis: str) -> Floats:
 
 
 def _fit_noise(
-    state: State,
-    row: int,
-    axis_effects: AxisEffects,
-    chosen: Bools,
-    wander: RandomProcesses,
+    state: State, row: int, axis_effects: AxisEffects, chosen: Bools, wander: RandomProcesses
 ) -> Posterior | None:
     """Fit the noise of an axis with the effects; None where too little is left to determine it."""
     blocks = state.blocks

@@ -98,13 +98,7 @@ def _explains_power(
 
 
 def _is_explained(
-    mean: Floats,
-    moving: Bools,
-    columns: Floats,
-    span: float,
-    settings: Settings,
-    *,
-    has_form: bool,
+    mean: Floats, moving: Bools, columns: Floats, span: float, settings: Settings, *, has_form: bool
 ) -> bool:
     """Return whether these columns leave next to nothing of a motion.
 

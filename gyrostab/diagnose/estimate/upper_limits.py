@@ -76,8 +76,7 @@ def _limit_candidate(candidate: Candidate, state: State) -> tuple[float, str]:
     if not first.columns:
         return math.nan, ""
     family = _select_variants(
-        candidate,
-        [variant for variant in candidate.variants if variant.columns == first.columns],
+        candidate, [variant for variant in candidate.variants if variant.columns == first.columns]
     )
     limits = (
         _limit_row(Component(candidate, family[0], row, 0.0), family, state)

@@ -111,10 +111,7 @@ def mean_factors(
     if wander is not None:
         setup["wander"] = wander
     white = mean_products(
-        values,
-        columns,
-        **(setup | {"K": np.zeros(1), "B": np.zeros(1)}),
-        present=present,
+        values, columns, **(setup | {"K": np.zeros(1), "B": np.zeros(1)}), present=present
     )
     widths = prior_widths(white.square)
     raw_square = (columns[present] ** 2 / setup["variance"][present, None]).sum(axis=0)

@@ -244,12 +244,7 @@ def log_evidence(
 
 
 def _equal_size_evidence(
-    products: Products,
-    chosen: Ints,
-    limits: Floats,
-    base: Floats,
-    widths: Floats,
-    is_bounded: bool,
+    products: Products, chosen: Ints, limits: Floats, base: Floats, widths: Floats, is_bounded: bool
 ) -> Floats:
     """Compute log marginal likelihoods (design, record) of designs (design, column)."""
     scale = limits[chosen]
@@ -300,10 +295,7 @@ def _bounded_evidence(
 
 
 def held_out_evidence(
-    factors: Floats,
-    owner: Sequence[int] | Ints,
-    *,
-    weight: Sequence[float] | Floats | None = None,
+    factors: Floats, owner: Sequence[int] | Ints, *, weight: Sequence[float] | Floats | None = None
 ) -> Floats:
     """Compute the held-out evidence (candidate, record), the largest over the fold lengths [nats].
 

@@ -432,11 +432,7 @@ def compare_visits(
 
 
 def _log_evidence(
-    products: Products,
-    chosen: Ints,
-    base_count: int,
-    variance: float,
-    log_weight: Floats,
+    products: Products, chosen: Ints, base_count: int, variance: float, log_weight: Floats
 ) -> tuple[float, float]:
     """Return the log evidence of columns, with a prior beyond `base_count`; and the step."""
     part = products._replace(

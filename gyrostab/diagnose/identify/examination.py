@@ -69,11 +69,7 @@ class Examination:
     ) -> list[CandidateEvidence]:
         """Compute the held-out evidence of candidates on the record."""
         return compute_evidence(
-            candidates,
-            state.blocks,
-            state,
-            self.folds,
-            count_evidence=self.count_evidence,
+            candidates, state.blocks, state, self.folds, count_evidence=self.count_evidence
         )
 
     def find_components(

@@ -249,10 +249,7 @@ def find_equivalent_effects(
 
 
 def find_spectral_alternatives(
-    effect: str,
-    components: Sequence[Component],
-    state: State,
-    examination: Examination,
+    effect: str, components: Sequence[Component], state: State, examination: Examination
 ) -> list[str]:
     """Return effects of the same channel, if the spectrum does not tell them apart.
 
@@ -289,9 +286,7 @@ def _any_spectrum(component: Component, state: State) -> Candidate:
 
 
 def passes_time_shift_test(
-    components: Sequence[Component],
-    state: State,
-    folds: xr.DataArray,
+    components: Sequence[Component], state: State, folds: xr.DataArray
 ) -> tuple[bool, float, float]:
     """Test whether an effect explains more than time-shifted surrogates of its channel.
 
@@ -331,10 +326,7 @@ def passes_time_shift_test(
 
 
 def _compute_shifted_evidence(
-    component: Component,
-    surrogates: Sequence[Variant | None],
-    state: State,
-    folds: xr.DataArray,
+    component: Component, surrogates: Sequence[Variant | None], state: State, folds: xr.DataArray
 ) -> Floats:
     """Return the evidence of the channel, then of each surrogate, on the axis of a component.
 

@@ -182,10 +182,7 @@ def ambiguous_evidence(
 
 
 def form_error(
-    components: Sequence[Component],
-    chosen: Sequence[Selection],
-    *,
-    settings: Settings = DEFAULTS,
+    components: Sequence[Component], chosen: Sequence[Selection], *, settings: Settings = DEFAULTS
 ) -> float:
     """Return what errors of the form of other effects may leave to these components [nats].
 

@@ -10,11 +10,7 @@ import numpy as np
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, keep_physical
-from gyrostab.diagnose.identify.identification import (
-    ambiguous_evidence,
-    form_error,
-    make_selection,
-)
+from gyrostab.diagnose.identify.identification import ambiguous_evidence, form_error, make_selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on, mean_columns
 from gyrostab.diagnose.predict.linear_model import State

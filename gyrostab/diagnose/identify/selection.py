@@ -63,9 +63,7 @@ def identify_effects(examination: Examination) -> Identifications:
     )
 
 
-def _select_all(
-    examination: Examination,
-) -> tuple[list[Selection], dict[str, tuple[str, float]]]:
+def _select_all(examination: Examination) -> tuple[list[Selection], dict[str, tuple[str, float]]]:
     """Select the best candidate, put it into the model, and repeat while one passes.
 
     What wanders without a course comes last, once no other effect passes. The second result is
@@ -131,11 +129,7 @@ def _explained_count_keys(examination: Examination, selection: Selection) -> set
 
 
 def score_candidates(
-    examination: Examination,
-    state: State,
-    barred: Collection[str],
-    *,
-    with_last: bool = True,
+    examination: Examination, state: State, barred: Collection[str], *, with_last: bool = True
 ) -> list[CandidateEvidence]:
     """Compute the evidence of all candidates that are not barred.
 

@@ -36,8 +36,7 @@ def prune_selections(examination: Examination, chosen: list[Selection]) -> list[
     The weakest is tested first. Then identifications lose the axes that no longer show them.
     """
     for selection in sorted(
-        chosen,
-        key=lambda selection: (selection.is_named, selection.evidence_nats),
+        chosen, key=lambda selection: (selection.is_named, selection.evidence_nats)
     ):
         if len(chosen) < 2:
             break

@@ -56,9 +56,7 @@ def without_pulses(chosen: Sequence[Selection], settings: Settings) -> list[Sele
 
 
 def withdraw_effects(
-    examination: Examination,
-    identified: Sequence[Selection],
-    unidentified: Sequence[Selection],
+    examination: Examination, identified: Sequence[Selection], unidentified: Sequence[Selection]
 ) -> tuple[list[Selection], list[Selection]]:
     """Withdraw parts of unidentified drifts, and noise levels that leave another course in time.
 
@@ -132,10 +130,7 @@ def _find_fluctuation(
 
 
 def _without_part_of_drift(
-    identified: Sequence[Selection],
-    unidentified: Sequence[Selection],
-    axis: str,
-    threshold: float,
+    identified: Sequence[Selection], unidentified: Sequence[Selection], axis: str, threshold: float
 ) -> list[Selection]:
     """Return effects without what an unidentified drift of an axis may be there.
 

@@ -29,11 +29,7 @@ MAX_MISMATCHES = 30  # of a record
 
 
 def locate_mismatches(
-    blocks: xr.Dataset,
-    baseline: xr.Dataset,
-    null: NullScores,
-    *,
-    level: float = 0.01,
+    blocks: xr.Dataset, baseline: xr.Dataset, null: NullScores, *, level: float = 0.01
 ) -> list[Region]:
     """Locate where a recording differs from the simulation by more than noise does.
 
@@ -60,11 +56,7 @@ def locate_mismatches(
 
 
 def _locate_regions(
-    statistic: Statistic,
-    blocks: xr.Dataset,
-    baseline: xr.Dataset,
-    null: NullScores,
-    level: float,
+    statistic: Statistic, blocks: xr.Dataset, baseline: xr.Dataset, null: NullScores, level: float
 ) -> list[Region]:
     """Locate the regions of one statistic, row by row.
 

@@ -15,11 +15,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Array, Complexes, Floats, Ints
-from gyrostab.diagnose.baseline.expected_statistics import (
-    line_columns,
-    sum_noise,
-    white_variance,
-)
+from gyrostab.diagnose.baseline.expected_statistics import line_columns, sum_noise, white_variance
 from gyrostab.diagnose.evidence.sample_counts import kurtosis_moments
 from gyrostab.diagnose.evidence.spectral_lines import interpolate_bands
 from gyrostab.diagnose.evidence.wandering import expected_processes
@@ -288,8 +284,7 @@ def _draw_means(
     blocks, baseline = setup.blocks, setup.baseline
     n, step = blocks.sizes["block"], float(blocks.attrs["block_s"])
     unit_variance = np.stack(
-        [white_variance(blocks, unit[None]) for unit in np.eye(4)[:2]],
-        axis=-1,
+        [white_variance(blocks, unit[None]) for unit in np.eye(4)[:2]], axis=-1
     )
     usual = np.einsum("abn,an->ab", unit_variance, baseline["square"].values[:, :2])
     drawn = np.einsum("abn,ran->rab", unit_variance, squares[..., :2])
@@ -372,10 +367,7 @@ def _correlate_lines(drawn: Floats, size: int) -> Floats:
 
 
 def _draw_cross(
-    setup: _NullSetup,
-    level: Floats,
-    between: Complexes | None,
-    rng: np.random.Generator,
+    setup: _NullSetup, level: Floats, between: Complexes | None, rng: np.random.Generator
 ) -> Complexes:
     """Return cross-spectra from those over the levels of both axes; independent ones if None."""
     first, second = pair_indices(setup.blocks)

@@ -124,12 +124,7 @@ _ROUNDS = 4  # steps of Fisher scoring
 
 
 def _fit_sizes(
-    expected: Floats,
-    columns: Floats,
-    prior: Floats,
-    low: Floats,
-    power: Floats,
-    shape: Floats,
+    expected: Floats, columns: Floats, prior: Floats, low: Floats, power: Floats, shape: Floats
 ) -> Floats:
     """Fit the sizes of columns (block, band, column) to powers with gamma distributions.
 

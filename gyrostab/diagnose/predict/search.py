@@ -34,10 +34,7 @@ class Trial(NamedTuple):
         return "record" in self.data.dims
 
     def recall(
-        self,
-        compute: Callable[[], Result],
-        group: Sequence[Candidate],
-        *inputs: Array | None,
+        self, compute: Callable[[], Result], group: Sequence[Candidate], *inputs: Array | None
     ) -> Result:
         """Compute something for candidates; on the recording, recall it if nothing has changed."""
         if self.is_null:

@@ -19,11 +19,7 @@ _RIDGE = 1e-12  # of the trace of the Gram matrix, against singular columns
 
 
 def mean_mixture(
-    state: State,
-    axis: str,
-    columns: Sequence[Floats],
-    *,
-    variance: Floats | None = None,
+    state: State, axis: str, columns: Sequence[Floats], *, variance: Floats | None = None
 ) -> Mixture:
     """Compute the sizes of columns of the block means of an axis, over the grid of K and B.
 

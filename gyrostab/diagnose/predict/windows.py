@@ -313,10 +313,7 @@ def weigh_by_time(variants: tuple[Variant, ...], windows: Windows) -> tuple[Vari
 
 
 def make_surrogates(
-    component: Component,
-    blocks: xr.Dataset,
-    coefficient: xr.DataArray,
-    shifts: Ints,
+    component: Component, blocks: xr.Dataset, coefficient: xr.DataArray, shifts: Ints
 ) -> list[Variant | None]:
     """Return the variant for channels that are rotated in time by each shift, end to start."""
     candidate = component.candidate

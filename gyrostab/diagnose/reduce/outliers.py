@@ -222,11 +222,7 @@ def simultaneous_samples(present: Bools) -> dict[tuple[bool, ...], Ints]:
 
 
 def zeros_beyond_chance(
-    together: Array,
-    zeros: Array,
-    samples: Array,
-    subset: Bools,
-    at_once: Array,
+    together: Array, zeros: Array, samples: Array, subset: Bools, at_once: Array
 ) -> Ints:
     """Subtract the zeros that independent axes, or a single axis, have at once by chance.
 

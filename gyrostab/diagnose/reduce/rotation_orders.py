@@ -31,14 +31,7 @@ _MIN_TURNS_APART = 0.9  # turns per block from a line that was removed; just bel
 class RotationOrders:
     """Demodulation of the axes at multiples of the tool rotation, in order of time."""
 
-    def __init__(
-        self,
-        log: xr.Dataset,
-        source: Source,
-        factor: float,
-        length: int,
-        rate: float,
-    ):
+    def __init__(self, log: xr.Dataset, source: Source, factor: float, length: int, rate: float):
         self.source, self.factor = source, factor  # rotation rate, and its factor to degree s-1
         self.start, self.rate, self.length = first_stamp(log), rate, length
         self.carry: float | None = None
@@ -57,12 +50,7 @@ class RotationOrders:
         return turns.reshape(-1, self.length), inside.reshape(-1, self.length)
 
     def measure(
-        self,
-        turns: Floats,
-        inside: Floats,
-        centred: Floats,
-        counts: Ints,
-        min_samples: float,
+        self, turns: Floats, inside: Floats, centred: Floats, counts: Ints, min_samples: float
     ) -> dict[str, Array]:
         """Demodulate blocks of the axes (axis, block, sample), zero where samples are missing."""
         often = inside.sum(axis=-1)
@@ -109,10 +97,7 @@ class _Harmonics(NamedTuple):
 
 
 def _fit_harmonics(
-    values: Floats,
-    wheels: Sequence[Complexes],
-    enough: Bools,
-    is_sampled: Bools,
+    values: Floats, wheels: Sequence[Complexes], enough: Bools, is_sampled: Bools
 ) -> _Harmonics:
     """Fit a constant and harmonics to the samples of each block by least squares.
 

@@ -27,11 +27,7 @@ from gyrostab.diagnose.result.attribution import attribute_mismatches
 from gyrostab.diagnose.result.content import SCHEMA, check_diagnosis
 from gyrostab.diagnose.result.diagnosis import Diagnosis, plain
 from gyrostab.diagnose.result.held_out import measure_evidence
-from gyrostab.diagnose.result.rejections import (
-    find_rejections,
-    find_unsupported,
-    rejected_tables,
-)
+from gyrostab.diagnose.result.rejections import find_rejections, find_unsupported, rejected_tables
 from gyrostab.diagnose.result.surfaces import make_surfaces
 from gyrostab.diagnose.result.tables import (
     baseline_table,
@@ -258,7 +254,5 @@ def keep_supported(
     if identified == [*identifications.identified]:
         return identifications
     return replace(
-        identifications,
-        identified=tuple(identified),
-        unknown=(*identifications.unknown, *unknown),
+        identifications, identified=tuple(identified), unknown=(*identifications.unknown, *unknown)
     )

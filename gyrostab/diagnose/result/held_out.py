@@ -14,10 +14,7 @@ import xarray as xr
 from gyrostab.arrays import Array, Bools, Floats
 from gyrostab.diagnose.baseline.calibrate import calibrate_on_known
 from gyrostab.diagnose.baseline.expected_statistics import reduced_shape
-from gyrostab.diagnose.estimate.conditioned_baseline import (
-    expected_baseline,
-    predict_baseline,
-)
+from gyrostab.diagnose.estimate.conditioned_baseline import expected_baseline, predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks

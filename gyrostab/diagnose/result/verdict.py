@@ -135,9 +135,5 @@ def decide_verdict(
         return "unknown" if mismatches else "no mismatch"
     if not _has_gain(held):
         return "unknown"
-    doubts = [
-        *unexplained,
-        *failed_checks(held, settings=settings),
-        *doubtful_names(effects),
-    ]
+    doubts = [*unexplained, *failed_checks(held, settings=settings), *doubtful_names(effects)]
     return "partly explained" if doubts else "explained"

@@ -9,12 +9,7 @@ import xarray as xr
 
 from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.wandering import allan_variance, expected_processes
-from gyrostab.diagnose.statistics.scores import (
-    Windows,
-    cumulative,
-    sum_over_windows,
-    window_set,
-)
+from gyrostab.diagnose.statistics.scores import Windows, cumulative, sum_over_windows, window_set
 from gyrostab.noise import LAWS
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.

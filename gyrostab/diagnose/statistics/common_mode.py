@@ -138,10 +138,7 @@ def _whiten_means(
 
 
 def _shared_increments(
-    present: Bools,
-    pairs: Pairs,
-    blocks: xr.Dataset,
-    baseline: xr.Dataset,
+    present: Bools, pairs: Pairs, blocks: xr.Dataset, baseline: xr.Dataset
 ) -> tuple[Floats, Floats]:
     """Return increments of one white noise (probe, axis, block), and the share of each pair."""
     series = np.random.default_rng(_PROBE_SEED).standard_normal((_PROBE_COUNT, 1, present.shape[1]))

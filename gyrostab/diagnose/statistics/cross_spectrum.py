@@ -202,11 +202,7 @@ class CrossSpectrum(Statistic):
 
 @np.errstate(divide="ignore", invalid="ignore")
 def _pair_coherency(
-    blocks: xr.Dataset,
-    baseline: xr.Dataset,
-    left: Ints,
-    right: Ints,
-    windows: Windows,
+    blocks: xr.Dataset, baseline: xr.Dataset, left: Ints, right: Ints, windows: Windows
 ) -> tuple[Complexes, Floats]:
     """Compute the coherency and the number of complex frequencies by (record), pair, window, band.
 

@@ -38,10 +38,7 @@ from gyrostab.diagnose.reduce.accumulate import RECORD_PARTS
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, choose_columns
-from gyrostab.diagnose.statistics.scores import (
-    cube_root_score,
-    statistic_dataset,
-)
+from gyrostab.diagnose.statistics.scores import cube_root_score, statistic_dataset
 from gyrostab.diagnose.statistics.wording import is_higher, subject, taus_text
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.registry import effects
@@ -153,8 +150,7 @@ class Power(Statistic):
             values,
             weight,
             variant_designs(
-                candidates,
-                lambda density: mix_with_mean(select_row(density, row), unspread, width),
+                candidates, lambda density: mix_with_mean(select_row(density, row), unspread, width)
             ),
             state.power_columns(axis),
             known=[level[..., number] * expected for number in range(level.shape[2])],

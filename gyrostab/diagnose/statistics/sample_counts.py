@@ -40,11 +40,7 @@ from gyrostab.diagnose.reduce.zero_bin import sticking_axes, truncated_axes
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.base import NullDraw, Region, SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.sample_sizes import estimate_from_counts
-from gyrostab.diagnose.statistics.scores import (
-    statistic_dataset,
-    sum_over_windows,
-    window_set,
-)
+from gyrostab.diagnose.statistics.scores import statistic_dataset, sum_over_windows, window_set
 from gyrostab.diagnose.statistics.wording import subject
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
@@ -232,11 +228,7 @@ def _kurtosis_score(excess: Floats, samples: Floats) -> tuple[Floats, Floats]:
 
 
 def _count_evidence(
-    name: str,
-    data: xr.Dataset,
-    state: State,
-    subsets: Bools,
-    count_evidence: CountEvidence,
+    name: str, data: xr.Dataset, state: State, subsets: Bools, count_evidence: CountEvidence
 ) -> Floats:
     """Return the evidence of a raised count, (record, axis)."""
     records = data.sizes.get("record", 1)
@@ -377,11 +369,7 @@ def _neighbour_statistics(blocks: xr.Dataset, sd: Floats) -> tuple[Floats, Float
 
 
 def _filled_zeros(
-    blocks: xr.Dataset,
-    zeros: Ints,
-    samples: Ints,
-    zero_again: Floats,
-    rng: np.random.Generator,
+    blocks: xr.Dataset, zeros: Ints, samples: Ints, zero_again: Floats, rng: np.random.Generator
 ) -> Ints:
     """Return the zeros (record, axis, block) that look filled because they coincide by chance.
 

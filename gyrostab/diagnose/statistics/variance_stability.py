@@ -183,10 +183,7 @@ def _band_groups(bands: int) -> list[Ints]:
 
 @np.errstate(divide="ignore", invalid="ignore")
 def _relative_levels(
-    blocks: xr.Dataset,
-    baseline: xr.Dataset,
-    used: Bools,
-    members: list[Ints],
+    blocks: xr.Dataset, baseline: xr.Dataset, used: Bools, members: list[Ints]
 ) -> tuple[list[tuple[Floats, Floats]], list[str]]:
     """Return the level over that of the record, with its shape, and the axes of each row.
 

@@ -12,11 +12,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Array
-from gyrostab.diagnose.baseline.correlated_bias import (
-    CorrelatedBias,
-    find_correlated_bias,
-    fit_rms,
-)
+from gyrostab.diagnose.baseline.correlated_bias import CorrelatedBias, find_correlated_bias, fit_rms
 from gyrostab.diagnose.baseline.expected_statistics import sum_noise
 from gyrostab.diagnose.evidence.held_out import mean_residual
 from gyrostab.diagnose.evidence.products import axis_noise

@@ -166,9 +166,7 @@ def describe_left_out(reason: str, names: Sequence[str], advice: str = "") -> li
 
 
 def name_columns(
-    plan: Plan,
-    columns: Sequence[FileColumn],
-    presets: Mapping[int, str],
+    plan: Plan, columns: Sequence[FileColumn], presets: Mapping[int, str]
 ) -> list[Header]:
     """Name the columns by ``--map``, then by the preset, and drop those that either drops."""
     headers = list(distinct_columns(columns))
@@ -247,11 +245,7 @@ class PresetMatch(NamedTuple):
     rate: float | None = None
 
 
-def find_preset(
-    path: Path,
-    columns: Sequence[FileColumn],
-    above: Sequence[str],
-) -> PresetMatch:
+def find_preset(path: Path, columns: Sequence[FileColumn], above: Sequence[str]) -> PresetMatch:
     """Find the preset that fits a file, with an empty name for the files of other programs.
 
     `above` are the lines above the header.

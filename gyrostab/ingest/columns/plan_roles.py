@@ -46,11 +46,7 @@ from gyrostab.wording import list_some
 
 
 def plan_columns(
-    path: Path,
-    columns: Sequence[FileColumn],
-    options: ReadOptions,
-    *,
-    above: Sequence[str] = (),
+    path: Path, columns: Sequence[FileColumn], options: ReadOptions, *, above: Sequence[str] = ()
 ) -> Plan:
     """Determine the role and unit of each column.
 

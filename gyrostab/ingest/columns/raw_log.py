@@ -118,10 +118,7 @@ class RawLogBuilder:
         )
 
     def add(
-        self,
-        converted: ConvertedBlock,
-        locate: Locate | None = None,
-        quote: Quote | None = None,
+        self, converted: ConvertedBlock, locate: Locate | None = None, quote: Quote | None = None
     ) -> None:
         """Add one block; messages name its rows by `locate` and `quote`."""
         if converted.rows == 0:

@@ -106,13 +106,7 @@ def _date_first_message(path: Path, options: ReadOptions) -> ReadOptions:
 
 
 def _count_time(
-    path: Path,
-    layout: Layout,
-    fetch: Any,
-    rows: int,
-    options: ReadOptions,
-    *,
-    needs_rate: bool,
+    path: Path, layout: Layout, fetch: Any, rows: int, options: ReadOptions, *, needs_rate: bool
 ) -> tuple[TableColumn | None, list[str]]:
     """Return the stamps by the counter of the layout, and a note on lost messages."""
     counter = layout.counter
@@ -135,12 +129,7 @@ def _count_time(
 
 
 def _read_field(
-    path: Path,
-    layout: Layout,
-    starts: Ints | None,
-    field: Field,
-    begin: int,
-    stop: int,
+    path: Path, layout: Layout, starts: Ints | None, field: Field, begin: int, stop: int
 ) -> Any:
     """Return the values of a field in a range of records, which begin at `starts`, or adjoin."""
     raw = np.memmap(path, dtype=np.uint8, mode="r", offset=layout.header)

@@ -157,11 +157,7 @@ def _representable_values(missing: Iterable[Any], stored: np.dtype[Any]) -> Iter
 
 
 def _valid_range(
-    where: str,
-    numbers: Mapping[str, Array],
-    stored: np.dtype[Any],
-    scale: float,
-    offset: float,
+    where: str, numbers: Mapping[str, Array], stored: np.dtype[Any], scale: float, offset: float
 ) -> tuple[float, float]:
     """Return the range of valid stored numbers.
 

@@ -310,11 +310,7 @@ def scan_tables(
 
 
 def read_tables(
-    path: Path,
-    tables: Sequence[Table],
-    options: ReadOptions,
-    *,
-    notes: Sequence[str] = (),
+    path: Path, tables: Sequence[Table], options: ReadOptions, *, notes: Sequence[str] = ()
 ) -> xr.Dataset:
     """Return the raw log of the tables with gyro axes; other channels keep separate stamps."""
     planned = _plan_tables(path, tables, options)

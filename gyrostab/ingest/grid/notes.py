@@ -113,10 +113,7 @@ def _count_of(number: int, noun: str) -> str:
 
 
 def describe_rate(
-    raw: xr.Dataset,
-    estimate: RateEstimate,
-    deviating: list[DeviatingStretch],
-    placement: Placement,
+    raw: xr.Dataset, estimate: RateEstimate, deviating: list[DeviatingStretch], placement: Placement
 ) -> list[str]:
     """Return notes on the sampling rate."""
     where, rate = record_name(raw), placement.rate

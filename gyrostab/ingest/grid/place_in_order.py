@@ -9,13 +9,7 @@ import numpy as np
 from gyrostab.arrays import Ints
 from gyrostab.errors import TimeError
 from gyrostab.ingest.gap_table import is_restart
-from gyrostab.ingest.grid.jitter import (
-    GAIN,
-    MIN_SIGMA,
-    TRACE_ROWS,
-    JitterModel,
-    observe_rows,
-)
+from gyrostab.ingest.grid.jitter import GAIN, MIN_SIGMA, TRACE_ROWS, JitterModel, observe_rows
 from gyrostab.ingest.grid.place import HOLD, NO_STAMPS, Placement, append_runs, make_placement
 from gyrostab.ingest.grid.starting_period import SECOND, Stamps, recut_blocks
 from gyrostab.kernels.grid.course import find_breaks, find_phase, trace
@@ -160,13 +154,7 @@ class _Placer:
 
 
 def place_in_order(
-    stamps: Stamps,
-    jitter: JitterModel,
-    rate: float,
-    *,
-    max_gap: float,
-    by_row: bool,
-    where: str,
+    stamps: Stamps, jitter: JitterModel, rate: float, *, max_gap: float, by_row: bool, where: str
 ) -> Placement:
     """Place rows in order, for stamps with jitter: see `gyrostab.ingest.grid.jitter`.
 

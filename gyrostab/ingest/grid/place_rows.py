@@ -17,12 +17,7 @@ from gyrostab.ingest.columns.stamps import read_stamps
 from gyrostab.ingest.concat.place import Match, count_alike
 from gyrostab.ingest.grid.jitter import MIN_SIGMA, JitterModel
 from gyrostab.ingest.grid.notes import describe_rate
-from gyrostab.ingest.grid.place import (
-    Placement,
-    make_placement,
-    place_by_count,
-    place_by_stamp,
-)
+from gyrostab.ingest.grid.place import Placement, make_placement, place_by_count, place_by_stamp
 from gyrostab.ingest.grid.place_in_order import place_in_order
 from gyrostab.ingest.grid.rate import (
     DeviatingStretch,

@@ -35,13 +35,7 @@ from gyrostab.ingest.grid.gaps import find_gaps
 from gyrostab.ingest.grid.notes import describe_angles, describe_channels, describe_placement
 from gyrostab.ingest.grid.place import Placement, check_grid
 from gyrostab.ingest.grid.place_rows import RowPlacer
-from gyrostab.ingest.grid.scan_pass import (
-    BLOCK_ROWS,
-    ScanPass,
-    file_of,
-    record_name,
-    scan_rows,
-)
+from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, record_name, scan_rows
 from gyrostab.ingest.limits import check_limits
 from gyrostab.ingest.uniform import as_uniform, check_same_rate
 from gyrostab.kernels.grid.stamps import NO_STAMP, RESTART, STEP

@@ -131,12 +131,7 @@ class BlockParser:
         filled = (cells[at] for at in faults if cells and cells[at].lower() not in VOID_CELLS)
         return repr(next(filled, line))
 
-    def _parse_cells(
-        self,
-        lines: dict[int, str],
-        values: Floats,
-        stamps: Ints | None,
-    ) -> int:
+    def _parse_cells(self, lines: dict[int, str], values: Floats, stamps: Ints | None) -> int:
         """Parse rows cell by cell into `values` and `stamps`; return the number of words."""
         rows = [self._split_row(line) for line in lines.values()]
         at, words = np.array(list(lines)), 0

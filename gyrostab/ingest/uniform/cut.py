@@ -13,13 +13,7 @@ import xarray as xr
 from gyrostab.arrays import Ints
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.gap_table import OUTSIDE_RANGE, clip_table, read_gaps
-from gyrostab.ingest.uniform.core import (
-    add_spans,
-    grid_of,
-    merge_spans,
-    place_samples,
-    with_table,
-)
+from gyrostab.ingest.uniform.core import add_spans, grid_of, merge_spans, place_samples, with_table
 from gyrostab.ingest.uniform.grid import UniformGrid
 from gyrostab.schema import check_log
 from gyrostab.time.durations import duration_seconds
@@ -245,11 +239,7 @@ def _cut_channels(part: xr.Dataset, edges: Ints) -> xr.Dataset:
 
 
 def _cut_table(
-    log: xr.Dataset,
-    grid: UniformGrid,
-    low: int,
-    kept_spans: Ints,
-    excluded: Ints,
+    log: xr.Dataset, grid: UniformGrid, low: int, kept_spans: Ints, excluded: Ints
 ) -> Ints:
     table = read_gaps(log, grid.start, grid.rate) if "gap" in log.dims else None
     if table is None:

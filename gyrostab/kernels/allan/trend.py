@@ -183,11 +183,7 @@ class _HeldAngles:
 
 
 def _edge_squares(
-    present: Bools,
-    starts: Ints,
-    window: int,
-    count: Floats,
-    centre: Floats,
+    present: Bools, starts: Ints, window: int, count: Floats, centre: Floats
 ) -> Floats:
     """Sum the squared weights of the angles in ``sum (place - centre) rate`` of each window.
 

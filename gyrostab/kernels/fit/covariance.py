@@ -321,11 +321,7 @@ def _fill_tables(window, ks, order, summed, diagonal, logarithm, table):  # type
 
 
 def product_tables(
-    window: int,
-    ks: Ints,
-    *,
-    variance: str = "avar",
-    diagonal: bool = False,
+    window: int, ks: Ints, *, variance: str = "avar", diagonal: bool = False
 ) -> tuple[Floats, Floats]:
     """Tabulate the covariance of a variance per product of squares, and with a ramp.
 

@@ -18,11 +18,7 @@ from numba import njit
 from gyrostab.arrays import Floats
 from gyrostab.kernels.compiled import INNER, KERNEL
 from gyrostab.kernels.fit.averages import FIT_FIELDS, average_submodels
-from gyrostab.kernels.fit.eight_solvers import (
-    back_substitute,
-    eliminate,
-    solve_nonnegative_eights,
-)
+from gyrostab.kernels.fit.eight_solvers import back_substitute, eliminate, solve_nonnegative_eights
 from gyrostab.kernels.fit.freedoms import degrees_of_freedom
 from gyrostab.kernels.fit.lanes import PLACES, eights, put, take, where_above
 from gyrostab.kernels.fit.mixture import (

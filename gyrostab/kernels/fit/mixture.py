@@ -26,12 +26,7 @@ WIDTH = 6
 #: Row of `seen` that holds the unit of each term.
 _SEEN = (0, 1, 3, 4, 5)
 #: Number of the product of two terms among the tables.
-_TABLE = (
-    (0, 1, 2, 3, 4),
-    (1, 5, 6, 7, 8),
-    (2, 6, 9, 10, 11),
-    (3, 7, 10, 12, 13),
-)
+_TABLE = ((0, 1, 2, 3, 4), (1, 5, 6, 7, 8), (2, 6, 9, 10, 11), (3, 7, 10, 12, 13))
 
 
 class Curves(NamedTuple):

@@ -55,12 +55,7 @@ def _slope_covariances(window: int) -> tuple[Floats, Floats]:
 
 
 def detrend_tables(
-    window: int,
-    ks: Ints,
-    pairs: Floats,
-    ramps: Floats,
-    *,
-    summed: bool = False,
+    window: int, ks: Ints, pairs: Floats, ramps: Floats, *, summed: bool = False
 ) -> TrendTables:
     """Turn the tables of Allan variances into those of Allan variances less their trend.
 

@@ -2,12 +2,7 @@
 
 from gyrostab.store.output.check import check_folder, check_output, check_target, resolve_link
 from gyrostab.store.output.content import find_foreign_item, read_json
-from gyrostab.store.output.inputs import (
-    describe_file,
-    find_sources,
-    follow_inputs,
-    protect_inputs,
-)
+from gyrostab.store.output.inputs import describe_file, find_sources, follow_inputs, protect_inputs
 from gyrostab.store.output.write import (
     is_leftover,
     new_folder,

@@ -274,8 +274,7 @@ def _replace_folder(temporary: Path, target: Path, find_foreign: FindForeign) ->
     _remove_tree(temporary)
     if temporary.exists():
         warnings.warn(
-            f"{temporary}: the folder that was replaced cannot be removed; delete it",
-            stacklevel=4,
+            f"{temporary}: the folder that was replaced cannot be removed; delete it", stacklevel=4
         )
 
 
