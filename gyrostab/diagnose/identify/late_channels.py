@@ -146,7 +146,7 @@ class DelaySearch:
         return best
 
     def exceeds_chance(self, best: Delay, count: int) -> bool:
-        """Test whether the best of `count` delays explains more than delays that no clock has.
+        """Test whether the best of `count` delays explains more than delays far from it.
 
         False if the channel resembles itself at most of them.
         """

@@ -19,6 +19,7 @@ from gyrostab.diagnose.baseline.expected_statistics import line_columns, sum_noi
 from gyrostab.diagnose.evidence.sample_counts import kurtosis_moments
 from gyrostab.diagnose.evidence.spectral_lines import interpolate_bands
 from gyrostab.diagnose.evidence.wandering import expected_processes
+from gyrostab.diagnose.predict.linear_model import unspread_share
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.diagnose.statistics.base import NullDraw
@@ -329,16 +330,16 @@ def _draw_lines(setup: _NullSetup, squares: Floats, rng: np.random.Generator) ->
     weight = blocks["line_weight"].values
     part_count, n = weight.shape[1], blocks.sizes["block"]
     part_of = np.arange(n) * part_count // n
-    neighbours = blocks["neighbours"].values
+    unspread = unspread_share(blocks)
     frequency, bands = blocks["line_frequency"].values, blocks["frequency"].values
     plain = squares @ line_columns(blocks).T
     flat = plain.mean(axis=-1, keepdims=True)
     out = np.full((*plain.shape[:2], part_count, plain.shape[2]), np.nan)
     for axis, part in np.ndindex(*weight.shape):
-        chosen = (part_of == part) & np.isfinite(neighbours[axis])
+        chosen = (part_of == part) & np.isfinite(blocks["neighbours"].values[axis])
         if not (chosen.any() and weight[axis, part] > 0.0):
             continue
-        share = neighbours[axis, chosen].mean()
+        share = unspread[axis, chosen].mean()
         over = setup.effects[axis, chosen].mean(axis=0)
         if "line_spectrum" in baseline:
             columns = baseline["columns"].values[axis, chosen]

@@ -240,6 +240,19 @@ def test_the_same_generator_gives_the_same_records():
     xr.testing.assert_identical(first, second)
 
 
+def test_lines_of_a_steep_spectrum_are_those_of_raw_records():
+    model = {"log": {"axes": ["x"]}, "noise": {"N": 0.003, "K": 3e4}}
+    records = [
+        reduce_log(simulate(model, duration="10min", rate=10.0, seed=seed)) for seed in range(20)
+    ]
+    baseline = baseline_from_model(records[0], {"noise": model["noise"]})
+    nulls = next(null_records(records[0], baseline, count=100, rng=np.random.default_rng(1)))
+    of_raw = np.mean([record["line_power"].values for record in records], axis=(0, 1, 2))
+    of_nulls = nulls["line_power"].values.mean(axis=(0, 1, 2))
+    upper = slice(3 * of_raw.size // 4, None)
+    assert np.mean(of_nulls[upper] / of_raw[upper]) == pytest.approx(1.0, abs=0.08)
+
+
 def test_drawing_many_lines_needs_little_memory_besides_the_records():
     log = simulate({"log": {"axes": ["x"]}, "noise": NOISE}, duration="10min", rate=400.0, seed=1)
     record = reduce_log(log)
