@@ -55,7 +55,7 @@ def sizes(effect):
 
 def found(runs):
     """Table of the effects that every run names."""
-    rows = [["against", "verdict", "named", "axes", "size, 95 %", "gain [nats]", "alternatives"]]
+    rows = [["against", "verdict", "named", "axes", "size, 95 %", "evidence, nats", "alternatives"]]
     for name, run in runs.items():
         for effect in run.effects or [{}]:
             gain = effect["held_out_gain"] if effect else {"nats": 0.0, "threshold": 0.0}

@@ -172,7 +172,7 @@ class Windows:
         samples); all; or a list, 0.1s,1s,10s.
     tau_max
         Longest averaging time, at most half of the window, or a third for hadamard and modified
-        (default: two thirds of that).
+        (default: two thirds of this limit).
     axis
         Analyse this gyro axis only: x. Repeat for more.
     variance
@@ -207,7 +207,7 @@ class Fitting:
         Noise terms to fit; NBK, for instance, leaves out Q and R.
     fit_from
         Shortest averaging time to fit, or all. Raise it to leave out a spectral line or motion at
-        short times (default: all times but those that a filter of the sensor shapes).
+        short times (default: all, except those at which a filter of the sensor shapes the noise).
     fit_to
         Longest averaging time to fit (default: all).
     """

@@ -132,7 +132,7 @@ class RotationLine(Effect):
     Examples
     --------
     >>> RotationLine(amplitude=0.5, harmonics=3, axes=["x"]).say()
-    'There are 3 lines locked to rotation_rate on axis x, the first of 0.5 deg/h at 1 per turn.'
+    'There are 3 lines locked to rotation_rate on axis x, the first of 0.5 deg/h at order 1 (cycles per turn).'
     """
 
     name = "rotation_line"
@@ -201,4 +201,5 @@ class RotationLine(Effect):
         many = "There is a line" if count == 1 else f"There are {count} lines"
         first = "of" if count == 1 else "the first of"
         size, order = self.quantity("amplitude", errors), self.quantity("order", errors)
-        return f"{many} locked to {channel} {self.on_axes()}, {first} {size} at {order} per turn."
+        place = f"{size} at order {order} (cycles per turn)"
+        return f"{many} locked to {channel} {self.on_axes()}, {first} {place}."

@@ -60,8 +60,8 @@ class TemperatureNoise(Effect):
     Examples
     --------
     >>> print(TemperatureNoise(linear=0.002, axes=["x"]).say())
-    The angle random walk follows the temperature on axis x: N^2 changes by 0.002 1/degC of its
-    value at 25 degC.
+    The angle random walk follows the temperature on axis x: relative to its value at 25 degC, N^2
+    changes by 0.002 1/degC.
     """
 
     name = "temperature_noise"
@@ -112,8 +112,9 @@ class TemperatureNoise(Effect):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         terms = [self.quantity(name, errors) for name in self.list_sizes() or ("linear",)]
-        change = f"changes by {', '.join(terms)} of its value at {self.quantity('reference')}"
-        return f"The angle random walk follows the temperature {self.on_axes()}: N^2 {change}."
+        start = f"relative to its value at {self.quantity('reference')}, N^2 changes by"
+        follows = f"The angle random walk follows the temperature {self.on_axes()}"
+        return f"{follows}: {start} {', '.join(terms)}."
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,7 +38,7 @@ class ScaleFactor(Effect):
     """
 
     name = "scale_factor"
-    short = "error proportional to (a function of) rotation rate"
+    short = "error that is a function of the rotation rate"
     plain = "a scale-factor error"
     next_measurement = (
         "rotate at two known rates in both directions: a scale-factor error is proportional to "
@@ -132,7 +132,7 @@ class Misalignment(Effect):
     Examples
     --------
     >>> Misalignment(z=0.5, axes=["x"]).say()
-    'The rotation of other axes leaks in on axis x, by 0.5 mrad of z.'
+    'Rotation about other axes shows on axis x through misalignment, by 0.5 mrad of z.'
     """
 
     name = "misalignment"
@@ -185,7 +185,7 @@ class Misalignment(Effect):
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         terms = [f"{self.quantity(name, errors)} of {name}" for name in self.list_sizes()]
         size = ", ".join(terms) or "nothing"
-        return f"The rotation of other axes leaks in {self.on_axes()}, by {size}."
+        return f"Rotation about other axes shows {self.on_axes()} through misalignment, by {size}."
 
 
 def _declare_tilt(axis: str) -> Any:

@@ -277,11 +277,11 @@ class ClockError(Effect):
     Examples
     --------
     >>> ClockError(error=50).say()
-    'The clock of the samples is fast by 50 ppm on all axes.'
+    'The sampling clock is fast by 50 ppm on all axes.'
     """
 
     name = "clock_error"
-    short = "wrong or drifting rate of time"
+    short = "sampling clock that is fast, slow or drifting"
     plain = "an error of the clock"
     next_measurement = "log a second clock, or a known frequency such as the mains"
     stage = "sampling"
@@ -370,7 +370,7 @@ class ClockError(Effect):
         fast, size = ("slow", -self.error) if self.error < 0 else ("fast", self.error)
         number = self.quantity("error", errors).replace(f"{self.error:.4g}", f"{size:.4g}", 1)
         more = f", growing by {self.quantity('drift', errors)}," if self.drift else ""
-        return f"The clock of the samples is {fast} by {number}{more} {self.on_axes()}."
+        return f"The sampling clock is {fast} by {number}{more} {self.on_axes()}."
 
 
 def _means_between(history: Floats, start: int, read: Floats) -> Floats:

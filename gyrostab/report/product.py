@@ -194,7 +194,7 @@ def _list_facts(product: xr.Dataset) -> list[tuple[str, str]]:
     ]
     if "sampling_rate_hz" in attrs:
         facts.append(("Sampling rate", f"{float(attrs['sampling_rate_hz']):g} Hz"))
-    plain = {"kind": "Kind of signal", "overlap": "Overlap"}
+    plain = {"kind": "Kind of signal"}
     facts += [
         (label, str(attrs[name]).replace("_", " "))
         for name, label in plain.items()

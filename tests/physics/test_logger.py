@@ -391,7 +391,7 @@ def test_large_clock_error_is_refused():
     with pytest.raises(OptionError, match="error reaches 210 %"):
         build_effect("clock_error", error=1e5, drift=1e4).begin(setup, rng)
     assert build_effect("clock_error", error=-50, drift=1).say() == (
-        "The clock of the samples is slow by 50 ppm, growing by 1 ppm/h, on all axes."
+        "The sampling clock is slow by 50 ppm, growing by 1 ppm/h, on all axes."
     )
 
 

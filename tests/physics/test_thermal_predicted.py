@@ -246,7 +246,7 @@ def test_overlapping_windows_use_means_only():
         ({"name": "temperature_bias", "sensitivity": 0.0}, r"by 0 deg/h/degC around 25 degC"),
         (
             {"name": "temperature_noise", "linear": 0.0, "quadratic": 1e-5},
-            r"N\^2 changes by 1e-05 1/degC\^2 of its value at 25 degC",
+            r"relative to its value at 25 degC, N\^2 changes by 1e-05 1/degC\^2\.",
         ),
         (
             {"name": "vibration_rectification", "sensitivity": 0.0, "quartic": 1e-6},

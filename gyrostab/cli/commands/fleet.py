@@ -41,7 +41,7 @@ def index(
     Parameters
     ----------
     archive
-        Folders, which are searched with all folders below, files, or quoted patterns.
+        Folders (searched with all their subfolders), files, or quoted patterns.
     output
         Parquet file to write, also at an address (s3://bucket/files.parquet).
     scheduler
@@ -89,8 +89,8 @@ def fleet(
     Parameters
     ----------
     archive
-        Folders, which are searched with all folders below, files, or quoted patterns; or a table
-        written by gyrostab index.
+        Folders (searched with all their subfolders), files, or quoted patterns; or a table written
+        by gyrostab index.
     output
         Folder to write: products, index.parquet, index.html and reports. FLEET.zarr makes the
         products groups of a Zarr store, also at an address (s3://bucket/fleet.zarr).

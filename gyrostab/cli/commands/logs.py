@@ -20,9 +20,9 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     """Summarise logs: time span, sampling rate, axes, channels, gaps and anomalies.
 
     Prints a table, the command to run next, and what windows of each length can observe. The table
-    has the gaps within each file, not those between files, and the rows of whole files, also with
-    --from, --to or --exclude. A file that cannot be read without further options is shown too:
-    every column, with a guess at the gyro axes, their unit and the time column.
+    counts the gaps within each file, not those between files, and always describes whole files,
+    even with --from, --to or --exclude. A file that cannot be read without further options is shown
+    too: every column, with a guess at the gyro axes, their unit and the time column.
 
     Example: gyrostab scan run7/*.csv
 

@@ -75,9 +75,9 @@ def correlate(
         File written by gyrostab run or gyrostab fit.
     with_
         Channels to compare with, separated by commas (default: temperature). With --channel, a
-        single channel, or those of several that the product lacks, are read from that file. A
-        single channel is compared together with its rate of change; of several, name the rate too
-        (temperature_rate).
+        single channel is read from that file; if you give several, those that the product lacks
+        are. A single channel is compared together with its rate of change; if you give several,
+        name the rate too (temperature_rate).
     max_lag
         Longest lag of the gyro behind the channel (default: one tenth of the record; 0s for none).
     output

@@ -43,8 +43,8 @@ def simulate(
         Length of the log: 1h, 200h. --rate and --start set its sampling rate and first time. All
         three may be set in the model instead.
     like
-        Recording whose time stamps, gaps and channels the log takes over, with those of its axes
-        that the model names. Repeat for a recording in several files.
+        Recording whose time stamps, gaps and channels the log copies. Its axes are those of
+        the recording that the model names. Repeat for a recording in several files.
     seed
         Seed of the random numbers. The same seed gives the same log, and the same noise with and
         without effects (default: the seed in the model, or 0).

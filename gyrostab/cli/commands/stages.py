@@ -65,8 +65,8 @@ def run(
     output
         NetCDF file or Zarr store (.zarr) to write; a Zarr store also at an address, s3://...
     dry_run
-        Print the windows and averaging times, and the time, memory and size of the output as
-        estimated from the first part, and write nothing.
+        Print the windows and averaging times, estimate time, memory and output size from the first
+        part, and write nothing.
     """
     _compile_fit_ahead()
     if dry_run:

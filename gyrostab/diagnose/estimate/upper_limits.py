@@ -57,7 +57,7 @@ def _limit_effect(kind: type[Effect], identifications: Identifications) -> dict[
         if math.isfinite(value):
             by_column[column] = max(value, by_column.get(column, value))
     if not by_column:
-        reason = "not identifiable: free noise does as much" if limits else "below limit"
+        reason = "not identifiable: free noise explains as much" if limits else "below limit"
         return {"upper_limit": math.nan, "unit": unit, "reason": reason}
     column = next((name for name in units if name in by_column), next(iter(by_column)))
     return {

@@ -28,7 +28,7 @@ from gyrostab.progress import Stage, no_stage
 #: Name -> description, in the order in which they are tried.
 NUISANCE_ALTERNATIVES = {
     "~bias(t)": "the bias wanders",
-    "~levels": "the bias steps between levels that differ",
+    "~levels": "the bias steps between several levels",
     "~N(t)": "the noise level changes",
     "~burst": "the noise level is higher for a while",
     "~S(f)": "the spectrum has another shape",

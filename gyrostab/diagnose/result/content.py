@@ -73,7 +73,7 @@ class NoiseEntry(_Table):
 
 
 class Expected(_Table):
-    """An effect of the model whose size is that of the recording."""
+    """An effect of the model whose size was taken from the recording."""
 
     name: str
     axes: list[str]

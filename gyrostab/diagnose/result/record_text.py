@@ -135,14 +135,14 @@ def delay_texts(content: Mapping[str, Any]) -> list[str]:
     Examples
     --------
     >>> delay_texts({"channel_delays": [{"name": "vibration", "delay_s": 103.0}]})
-    ['The time stamps of channel vibration are 103 s late: the rates follow it that much earlier.']
+    ['The time stamps of channel vibration are 103 s late; the diagnosis uses the channel that much earlier.']
     """
     return [
         f"The time stamps of channel {channel['name']} are {abs(channel['delay_s']):g} s "
         + (
-            "late: the rates follow it that much earlier."
+            "late; the diagnosis uses the channel that much earlier."
             if channel["delay_s"] > 0.0
-            else "early: the rates follow it that much later."
+            else "early; the diagnosis uses the channel that much later."
         )
         for channel in content.get("channel_delays", [])
     ]
@@ -215,7 +215,7 @@ def _unequal_noise_texts(noise: Mapping[str, Any], settings: Settings) -> list[s
         names = join_words([other for other in noise if other != axis])
         texts.append(
             f"{symbol} of {axis} is at least {entry['value'] / largest:.2g} times that of {names}: "
-            f"a wandering bias on {axis} would be part of the simulated noise."
+            f"a wandering bias on {axis} may have been calibrated as noise."
         )
     return texts
 

@@ -356,10 +356,10 @@ def unidentified_mismatches(
             continue
         p_value = float(null.probability(unidentified.evidence_nats))
         nearest = unidentified.alternatives
-        verb = "comes" if len(nearest) == 1 else "come"
+        closest = "effect is" if len(nearest) == 1 else "effects are"
         explanation = (
-            f"{join_words([plain_name(name) for name in nearest])} {verb} closest, but "
-            "another form explains more"
+            f"the closest known {closest} {join_words([plain_name(name) for name in nearest])}, "
+            "but another form explains more"
             if nearest
             else "no known effect explains it"
         )

@@ -247,18 +247,21 @@ def rejection_text(beaten_by: str, nats: float | None) -> str:
     Examples
     --------
     >>> rejection_text("supply_bias", 12.34)
-    'a bias that follows supply voltage or light power explains 12.3 nats more'
+    'the evidence of a bias that follows supply voltage or light power is 12.3 nats larger'
     >>> rejection_text("noise", 5.0), rejection_text("an impossible size", None)
     ('its evidence is 5.0 nats below the threshold', 'it would need an impossible size')
     """
     if beaten_by == "noise":
         return "" if nats is None else f"its evidence is {nats:.1f} nats below the threshold"
     if nats is None:
-        return f"it would need {beaten_by}"
+        is_zero = beaten_by == "a size of zero"
+        return "its size may be zero" if is_zero else f"it would need {beaten_by}"
     winner = plain_name(beaten_by) if beaten_by in effects() else beaten_by
+    if winner.startswith("the "):  # a nuisance alternative, which is a clause
+        winner = f"a model in which {winner}"
     if nats < 0.0:
-        return f"{winner} comes first, although it explains {-nats:.1f} nats less"
-    return f"{winner} explains {nats:.1f} nats more"
+        return f"the order of similar effects puts {winner} first, with {-nats:.1f} nats less"
+    return f"the evidence of {winner} is {nats:.1f} nats larger"
 
 
 def next_measurement(name: str, alternatives: Sequence[str]) -> str:

@@ -190,7 +190,7 @@ def test_models_are_valid_toml_with_the_same_numbers(noise: dict[str, float], ax
 def test_page_says_why_other_effects_were_not_named(tmp_path: Path):
     page = write_diagnosis_report(diagnosis(), tmp_path / "d.html").read_text(encoding="utf-8")
     assert "Why not?" in page
-    assert "(vibration rectification) explains 4.2 nats more" in page
+    assert "(vibration rectification) is 4.2 nats larger" in page
     assert "looked for, not seen; its evidence is 6.0 nats below the threshold" in page
 
 
@@ -199,8 +199,12 @@ def test_page_says_why_other_effects_were_not_named(tmp_path: Path):
     [
         ("noise", None, ""),
         ("an impossible size", None, "it would need an impossible size"),
-        ("an event that ends", 5.0, "an event that ends explains 5.0 nats more"),
-        ("spikes", -5.0, "comes first, although it explains 5.0 nats less"),
+        ("an event that ends", 5.0, "the evidence of an event that ends is 5.0 nats larger"),
+        (
+            "spikes",
+            -5.0,
+            "the order of similar effects puts bit errors or outliers first, with 5.0 nats less",
+        ),
     ],
 )
 def test_rejection_names_the_competitor(beaten_by: str, nats: float | None, text: str):
@@ -371,7 +375,7 @@ def test_page_without_findings(tmp_path: Path):
     write_diagnosis_report(Diagnosis(nothing, surfaces(), {"noise": {}}), tmp_path / "report.html")
     text = " ".join(Page((tmp_path / "report.html").read_text(encoding="utf-8")).words)
     assert "agrees with the simulation within noise" in text
-    assert "differs from the simulation nowhere" in text
+    assert "differs nowhere from the simulation" in text
 
 
 @plain_pages
