@@ -131,8 +131,9 @@ class RotationLine(Effect):
 
     Examples
     --------
-    >>> RotationLine(amplitude=0.5, harmonics=3, axes=["x"]).say()
-    'There are 3 lines locked to rotation_rate on axis x, the first of 0.5 deg/h at order 1 (cycles per turn).'
+    >>> print(RotationLine(amplitude=0.5, harmonics=3, axes=["x"]).say())
+    There are 3 lines locked to rotation_rate on axis x, the first of 0.5 deg/h at order 1 (cycles
+    per turn).
     """
 
     name = "rotation_line"

@@ -66,6 +66,12 @@ def test_quadrupole_cancels_shupe_except_for_trim_error():
     assert trimmed == pytest.approx(expected, rel=1e-3)
 
 
+def test_outer_layers_of_a_quadrupole_are_the_ends_of_the_fiber():
+    weights = np.abs(instrument.layer_weights(24))
+    assert weights[0] == weights.max()  # wound from the middle of the fiber, on the spool
+    assert weights[:4].min() > 5 * weights[-4:].max()
+
+
 def test_detector_noise_terms_have_their_power_laws():
     power = np.array([1e-6, 4e-6])
     shot = instrument.relative_psd(power, rin=0.0, load=1e12)

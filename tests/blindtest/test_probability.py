@@ -71,6 +71,13 @@ def test_coverage_counts_records_with_effects(drawn):
     assert risk["risk"].equals(risk_coverage(rows)["risk"])
 
 
+def test_a_name_of_no_probability_does_not_cover_records_without_a_name():
+    rows = rows_of(np.array([0.0, 0.9]), np.array([True, True]))
+    silent = [row | {"index": 1000 + k, "identifications": []} for k, row in enumerate(rows)]
+    risk = risk_coverage([*rows, *silent])
+    assert risk[["least", "coverage"]].to_numpy().tolist() == [[0.9, 0.25], [0.0, 0.5]]
+
+
 def test_names_of_equal_probability_are_one_group():
     stated = np.repeat([0.5, 0.95], [20, 80])
     right = np.concatenate([np.arange(20) < 10, np.arange(80) < 76])

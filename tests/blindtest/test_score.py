@@ -296,6 +296,12 @@ def test_accepted_name_in_addition_is_not_wrong():
     assert row["named"]
 
 
+def test_an_accepted_name_of_an_effect_out_of_catalogue_is_no_miss():
+    three_levels = truth("three_levels", kind="out_of_catalogue", accepted=["telegraph"])
+    row = score_one(diagnosis(identification("telegraph")), three_levels)
+    assert (row["unidentified"], row["wrong"]) == (True, 0)
+
+
 @pytest.mark.parametrize(
     ("answer", "unknown", "wrong"),
     [
@@ -640,6 +646,15 @@ def test_share_of_repeated_rows_without_a_flag_has_the_interval_of_the_records()
     rows = [{"index": place // 5, "flag": False} for place in range(100)]
     line = share("", rows, "flag")
     assert (line["n"], line["low"], line["high"]) == (100, *wilson(0, 20))
+
+
+def test_share_near_its_end_has_no_narrower_interval_than_independent_rows():
+    rows = [{"index": min(place, 149), "flag": place not in (3, 30)} for place in range(200)]
+    line = share("", rows, "flag")
+    low, high = wilson(198, 200)
+    assert (line["value"], line["high"]) == (0.99, 1.0)
+    assert high < 1.0
+    assert line["low"] == pytest.approx(low)
 
 
 @given(

@@ -21,7 +21,7 @@ from gyrostab.blindtest.generator.detection_limits import NATS, fitted_nats
 from gyrostab.blindtest.generator.record import UNITS
 from gyrostab.blindtest.generator.scenario import Effect, Scenario
 
-_ROUNDS = 6  # to raise a strength in fitted noise, which is roughly proportional to the strength
+_ROUNDS = 30  # at most, to raise a strength in fitted noise: that of slow effects grows slowly
 _MARGIN = 1.02  # of the strength above that proportion
 _MAX_FACTOR = 8.0  # of the strength in known noise over the one in fitted noise
 

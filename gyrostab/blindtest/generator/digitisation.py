@@ -68,8 +68,9 @@ def dead_zone(scenario: Scenario, rng: np.random.Generator, *, strength: float) 
 def clipping(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
     """Draw a range that clips one axis on one side or both, with a hard edge or a soft knee."""
     axis = int(rng.integers(3))
-    number = max(1, round(NATS * strength**2 / NATS_PER_SAMPLE))
+    equal = max(1, round(NATS * strength**2 / NATS_PER_SAMPLE))  # to another one
     is_two_sided, soft = bool(rng.random() < 0.5), bool(rng.random() < 0.4)
+    number = equal + (2 if is_two_sided else 1)  # the first at a limit could be noise
 
     def after(record: Floats) -> Floats:
         row = record[axis]
@@ -91,8 +92,8 @@ def clipping(scenario: Scenario, rng: np.random.Generator, *, strength: float) -
         form=("on both sides" if is_two_sided else "above")
         + (", with a soft knee" if soft else ""),
         form_differs=soft,
-        size=math.sqrt(number * NATS_PER_SAMPLE / NATS),
-        nats=number * NATS_PER_SAMPLE,
+        size=math.sqrt(equal * NATS_PER_SAMPLE / NATS),
+        nats=equal * NATS_PER_SAMPLE,
         tau=(1 / scenario.rate, 10 / scenario.rate),
         after=after,
     )

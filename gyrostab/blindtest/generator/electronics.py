@@ -34,6 +34,7 @@ from gyrostab.blindtest.generator.shapes import (
 
 _FREQUENCIES = 200 * BANDS  # of the spectrum of a source
 _MAX_SHARE = math.sqrt(0.8)  # of a source in the noise of an axis, as an amplitude
+_MAX_FILTER_WEIGHT = 0.45  # of the other samples in the output of a filter
 
 
 def spectral_line(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
@@ -205,7 +206,7 @@ def logger_filter(scenario: Scenario, rng: np.random.Generator, *, strength: flo
     kind = str(rng.choice(["three", "pole", "mean"]))
 
     def taps(a: float) -> Floats:
-        a = min(a, 0.45)
+        a = min(a, _MAX_FILTER_WEIGHT)
         return {
             "three": np.array([a / 2, 1 - a, a / 2]),
             "pole": (1 - a) * a ** np.arange(25),
@@ -244,10 +245,11 @@ def logger_filter(scenario: Scenario, rng: np.random.Generator, *, strength: flo
         first = record[:, :1]
         return np.asarray(first + lfilter(weights, [weights.sum()], record - first, axis=1))
 
-    parameters = {"weight": {"value": amplitude, "unit": "1"}}
+    weight = min(amplitude, _MAX_FILTER_WEIGHT)
+    parameters = {"weight": {"value": weight, "unit": "1"}}
     if kind == "pole":
         parameters["cutoff"] = {
-            "value": -math.log(min(amplitude, 0.45)) * scenario.rate / (2 * math.pi),
+            "value": -math.log(weight) * scenario.rate / (2 * math.pi),
             "unit": "Hz",
             "unless": ["length"],
         }

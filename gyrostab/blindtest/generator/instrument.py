@@ -76,7 +76,9 @@ def layer_weights(layers: int, *, trim: float = 0.0, scatter: Floats | None = No
     side = np.where(np.isin(np.arange(layers) % 4, (0, 3)), 1.0, -1.0)
     weights = np.zeros(layers)
     for sign in (1.0, -1.0):
-        mine = np.flatnonzero(side == sign)
+        mine = np.flatnonzero(side == sign)[
+            ::-1
+        ]  # from the spool, where the middle of the fiber is
         ends = np.cumsum(lengths[mine])
         begins = ends - lengths[mine]
         weights[mine] = sign * (

@@ -155,16 +155,17 @@ def prove(
         sums, commitment = read_sums(folder) or _draw_and_commit(
             folder, plans, run_step, None if real is None else Path(real)
         )
-        tell(f"committed: {len(plans)} truths, SHA-256 of their list {commitment}")
-        failed = _diagnose_all(folder, job, list(plans), run_step)
+        tell(f"committed: {len(sums)} truths, SHA-256 of their list {commitment}")
+        failed = _diagnose_all(folder, job, list(sums), run_step)
         truths = {
-            name: open_truth(folder / "truth" / f"{name}.json", sha256=sums[name]) for name in plans
+            name: open_truth(folder / "truth" / f"{name}.json", sha256=digest)
+            for name, digest in sums.items()
         }
         baseline_scores = _compare_all(folder, truths, run_step)
         stage("counting", 0)
         diagnoses = {
             name: json.loads((folder / "diagnoses" / f"{name}.json").read_text(encoding="utf-8"))
-            for name in plans
+            for name in sums
             if name not in failed
         }
         rows = score_rows(diagnoses, truths, baseline_scores)

@@ -319,6 +319,8 @@ def commit_case(log: xr.Dataset, truth: dict[str, Any], directory: Path, *, name
 
 def open_truth(path: Path, *, sha256: str) -> dict[str, Any]:
     """Read a truth; raise `FormatError` unless it is the one that was committed as `sha256`."""
+    if not path.exists():
+        raise FormatError(f"{path}: the truth was deleted after it was committed; restore it")
     text = path.read_text(encoding="utf-8")
     if fingerprint(text) != sha256:
         raise FormatError(

@@ -96,8 +96,12 @@ def risk_coverage(rows: Sequence[Row]) -> pd.DataFrame:
     surest = np.array(
         [
             max(
-                (identification["probability"] or 0.0 for identification in row["identifications"]),
-                default=0.0,
+                (
+                    identification["probability"]
+                    for identification in row["identifications"]
+                    if identification["probability"] is not None
+                ),
+                default=-math.inf,
             )
             for row in records
         ]

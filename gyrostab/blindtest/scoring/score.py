@@ -248,7 +248,10 @@ def score_case(
         "unidentified": bool(
             detected
             and not wrong
-            and (diagnosis["verdict"] in ("unknown", "partly explained") or not identifications)
+            and (
+                diagnosis["verdict"] in ("unknown", "partly explained")
+                or all(entry["name"] in accepted for entry in identifications)
+            )
         ),
         "identifications": [
             {

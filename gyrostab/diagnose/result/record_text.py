@@ -134,8 +134,9 @@ def delay_texts(content: Mapping[str, Any]) -> list[str]:
 
     Examples
     --------
-    >>> delay_texts({"channel_delays": [{"name": "vibration", "delay_s": 103.0}]})
-    ['The time stamps of channel vibration are 103 s late; the diagnosis uses the channel that much earlier.']
+    >>> print(*delay_texts({"channel_delays": [{"name": "vibration", "delay_s": 103.0}]}))
+    The time stamps of channel vibration are 103 s late; the diagnosis uses the channel that much
+    earlier.
     """
     return [
         f"The time stamps of channel {channel['name']} are {abs(channel['delay_s']):g} s "
