@@ -194,6 +194,35 @@ def test_resumed_finished_run_repeats_the_scores(finished, small):
     assert resumed.commitment == before.commitment
 
 
+def test_run_that_another_version_drew_is_completed(finished, small, monkeypatch):
+    folder, *_ = finished
+    scores = (folder / "scores.csv").read_bytes()
+    planned = core._plan_all
+
+    def plan_others(job):
+        first, *others = planned(job).items()
+        return dict([*others, ("f" * 12, first[1])])
+
+    with monkeypatch.context() as patch:
+        patch.setattr(core, "_plan_all", plan_others)
+        gyrostab.prove(folder, workers=0, resume=True)
+    again = (folder / "scores.csv").read_bytes()
+    assert sorted(again.splitlines()) == sorted(scores.splitlines())
+    gyrostab.prove(folder, workers=0, resume=True)
+
+
+def test_deleted_truth_is_named(finished, small):
+    folder, *_ = finished
+    path = folder / "truth" / f"{case_name(5, 1)}.json"
+    text = path.read_text()
+    path.unlink()
+    try:
+        with pytest.raises(FormatError, match="deleted after it was committed"):
+            gyrostab.prove(folder, workers=0, resume=True)
+    finally:
+        path.write_text(text)
+
+
 def test_changed_truth_is_refused(finished, small):
     folder, *_ = finished
     name = case_name(5, 1)

@@ -155,17 +155,18 @@ def prove(
         sums, commitment = read_sums(folder) or _draw_and_commit(
             folder, plans, run_step, None if real is None else Path(real)
         )
-        tell(f"committed: {len(sums)} truths, SHA-256 of their list {commitment}")
-        failed = _diagnose_all(folder, job, list(sums), run_step)
+        # another version may have drawn other cases
+        names = [name for name in plans if name in sums] + sorted(sums.keys() - plans.keys())
+        tell(f"committed: {len(names)} truths, SHA-256 of their list {commitment}")
+        failed = _diagnose_all(folder, job, names, run_step)
         truths = {
-            name: open_truth(folder / "truth" / f"{name}.json", sha256=digest)
-            for name, digest in sums.items()
+            name: open_truth(folder / "truth" / f"{name}.json", sha256=sums[name]) for name in names
         }
         baseline_scores = _compare_all(folder, truths, run_step)
         stage("counting", 0)
         diagnoses = {
             name: json.loads((folder / "diagnoses" / f"{name}.json").read_text(encoding="utf-8"))
-            for name in sums
+            for name in names
             if name not in failed
         }
         rows = score_rows(diagnoses, truths, baseline_scores)
