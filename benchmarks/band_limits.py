@@ -34,7 +34,7 @@ N = 0.01
 #: Mixtures without a filter, for false alarms: coefficients, share and length of the losses.
 PLAIN = {
     "N": ({"N": N}, 0.0, 1),
-    "N, 20 % lost in blocks of 50": ({"N": N}, 0.2, 50),
+    "N, 20 % lost in bursts of 50": ({"N": N}, 0.2, 50),
     "Q": ({"Q": 0.4}, 0.0, 1),
     "N, Q": ({"N": N, "Q": 0.4}, 0.0, 1),
     "N, B": ({"N": N, "B": 1.0}, 0.0, 1),

@@ -91,7 +91,7 @@ def main() -> None:
     arguments = parser.parse_args()
     rows = []
     with dask.config.set(scheduler="sync"):
-        for name in ("none", "10 % in blocks of 1000"):
+        for name in ("none", "10 % in bursts of 1000"):
             x = record(name != "none")
             for taus in (24, 40, 48):
                 size, (whole, kernel, *parts, once) = measure(x, taus, arguments.repeats)

@@ -110,7 +110,8 @@ def judge(product: xr.Dataset, squares: np.ndarray) -> list[str]:
         cells.append(
             f"{value.mean() / true:.2f} ({(value.mean() - true) / value.std():+.2f}); seen "
             f"{is_observed.mean():.2f}; holds {holds.mean():.3f}; exceeded "
-            + " / ".join(f"{share:.3f}" for share in exceeded)
+            + " (not observed ".join(f"{share:.3f}" for share in exceeded)
+            + ")" * (len(exceeded) - 1)
         )
     return cells
 

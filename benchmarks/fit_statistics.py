@@ -29,7 +29,7 @@ MIXTURES: dict[str, dict[str, float]] = {
     "N + K": {"N": 0.01, "K": 40.0},
     "Q + N + K": {"Q": 0.4, "N": 0.01, "K": 200.0},
 }
-GAPS = {"none": (0.0, 1.0), "20 %, blocks of 50": (0.2, 50.0), "20 %, blocks of 5": (0.2, 5.0)}
+GAPS = {"none": (0.0, 1.0), "20 %, bursts of 50": (0.2, 50.0), "20 %, bursts of 5": (0.2, 5.0)}
 #: Noise whose trend gaps change most, and samples that are lost: a place, or (share, block).
 TREND_TRIALS = 300
 TREND_NOISES: dict[str, dict[str, float]] = {
@@ -44,8 +44,8 @@ LOSSES: dict[str, slice | tuple[float, float]] = {
     "last 70 %": slice(3 * SAMPLES // 10, None),
     "middle 50 %": slice(SAMPLES // 4, 3 * SAMPLES // 4),
     "10 %, one by one": (0.1, 1.0),
-    "20 %, blocks of 5": (0.2, 5.0),
-    "50 %, blocks of 50": (0.5, 50.0),
+    "20 %, bursts of 5": (0.2, 5.0),
+    "50 %, bursts of 50": (0.5, 50.0),
     "20 %, one by one": (0.2, 1.0),
 }
 

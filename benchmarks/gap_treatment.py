@@ -109,7 +109,7 @@ TREATMENTS: dict[str, Treatment] = {
 
 
 def measure(rows: np.ndarray, term: str, truth: float, treat: Treatment) -> tuple[str, float]:
-    """Return the cell of a table, and the median scatter next to gaps over the rest."""
+    """Return the cell of a table, and the median scatter next to gaps relative to elsewhere."""
     results = []
     for row in rows:
         product = gyrostab.fit_noise(treat(row), observed_only=False).isel(axis=0, time=0)
@@ -127,7 +127,7 @@ def main() -> None:
     parser.add_argument("--records", type=int, default=100)
     chosen = parser.parse_args()
     rows = []
-    edges = ["", "scatter next to gaps over the rest"]
+    edges = ["", "scatter next to gaps / elsewhere"]
     for term in TRUTH:
         made = [make_records(term, loss, chosen.records) for loss in LOSSES.values()]
         for name, treat in TREATMENTS.items():

@@ -214,8 +214,9 @@ def shape(name: str, taus: str, repeats: int, quick: bool) -> Iterator[str]:
             label, f"{value:.4f}", *(f"{took[rival] / value:.1f}" for rival in rivals),
             f"{share:.2f}" if label.startswith("block") else "",
         ])  # fmt: skip
-    head = ["one thread", "seconds", "times as fast as allantools", "as the recursion",
-            "as every window anew", "share of the bare loop"]  # fmt: skip
+    head = ["one thread", "seconds", "times as fast as allantools",
+            "times as fast as the recursion", "times as fast as every window anew",
+            "share of the bare loop"]  # fmt: skip
     yield table(head, rows)
 
 

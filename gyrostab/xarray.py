@@ -55,7 +55,7 @@ class GyroAccessor:
     def fit(self, **options: Any) -> xr.Dataset:
         """Fit the noise terms to a surface; options of `gyrostab.fit_noise`.
 
-        Compute the surface first if this is a log or signal; the options then are those of
+        Compute the surface first if this is a log or signal; the options are then those of
         `gyrostab.davar` (also ``tau_max``), and the others of `gyrostab.fit_noise`.
         """
         if self._holds_variable("avar"):
@@ -91,7 +91,7 @@ class GyroAccessor:
 class GyrostabBackend(BackendEntrypoint):
     """Open logs, surfaces and products: ``xr.open_dataset("log.nc", engine="gyrostab")``.
 
-    Dimensions, units and the computed ``time`` are those of `gyrostab.open_log`,
+    Dimensions, units and the computed ``time`` are the same as in `gyrostab.open_log`,
     `gyrostab.open_surface` and `gyrostab.open_product`. Values stay in the file until they are
     used, in dask arrays if ``chunks`` is given. ``strict=True`` raises an error for a damaged chunk
     of a log instead of leaving a gap.

@@ -69,7 +69,8 @@ def illustrate(page):
                     + "\n\n<!-- figure -->\n<!-- end of figure -->\n"
                     + "\n" * (number + 1 < len(parts))
                 )
-            image = f"![{effects()[name].short}](../figures/effects/{name}.png)"
+            kind = effects()[name]
+            image = f"![{kind.plain or kind.short}](../figures/effects/{name}.png)"
             parts[number] = between(
                 part,
                 "figure",

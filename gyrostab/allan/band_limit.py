@@ -8,7 +8,7 @@ Allan variance
 
 where r is the autocorrelation of the filtered noise. This holds for any filter; c is the time
 constant of a first-order low-pass, and a third of the length of a moving average. The squared
-coefficient N^2 is that of the noise without the filter. It follows from the Allan variance as a sum
+coefficient N^2 describes the noise without the filter. It follows from the Allan variance as a sum
 over increments, ``(4 D(tau) - D(2 tau)) / (2 tau^2)``.
 """
 
@@ -38,7 +38,7 @@ _MIN_TAU_RATIO = 10.0
 #: Shortest averaging time to fit over the first that is described: what remains of the memory there
 #: hides in the scatter, but biases N by up to 4 % (docs/statistics.md).
 _MEMORY_MARGIN = 1.5
-#: Largest time constant over the shortest averaging time: 1/2 for the mean of two samples, the
+#: Largest ratio of time constant to shortest averaging time: 1/2 for the mean of two samples, the
 #: shortest moving average, and less for longer ones.
 _MAX_TIME_CONSTANT = 0.6
 #: Steps of the search for the time constant; each goes on around the best of these values.
@@ -53,7 +53,7 @@ _MAX_SHORTEST_RATIO, _MAX_RATIO = 0.9, 1.05
 #: Least share of what a first-order low-pass removes at the shortest averaging time: white noise
 #: that changes its level seems to lack a little power at all short averaging times.
 _MIN_REMOVED_SHARE = 0.5
-#: Largest Allan variance of a window over the median at any averaging time: a window above it holds
+#: Largest ratio of a window's Allan variance to the median at any averaging time: one above it has
 #: motion.
 _MAX_WINDOW_RATIO = 10.0
 _N_BIT, _Q_BIT = 2, 1
@@ -143,8 +143,8 @@ def find_band_limit(
 ) -> BandLimit:
     """Find the band limit of an axis from windows that do not overlap.
 
-    The windows, each over its variance at the shortest averaging time, are averaged: a sum of the
-    five terms stays one. Where the terms describe this average, there is no limit. Otherwise the
+    Each window is divided by its variance at the shortest averaging time and averaged: a sum of the
+    five terms remains one. Where the terms describe this average, there is no limit. Otherwise the
     shortest averaging time is sought from which N (behind a filter), B and K describe it. It is the
     band limit if the Allan variance below lacks power against that without the filter, and nowhere
     exceeds it.
@@ -197,7 +197,7 @@ def _round_number(value: float) -> float:
 
 
 class _Mean(NamedTuple):
-    """Average of windows: rows as of a window, trend and its responses, number of windows."""
+    """Average of windows: the rows of a window, trend and its responses, number of windows."""
 
     tau: Floats
     rows: list[Floats]
@@ -231,7 +231,7 @@ class _Mean(NamedTuple):
 def _average_windows(
     tau: Floats, cells: Sequence[Floats], trend: Floats, responses: Floats, tables: FitTables
 ) -> _Mean | None:
-    """Average the windows without motion, each over its variance at the shortest averaging time."""
+    """Average windows without motion, each divided by its variance at the shortest tau."""
     level = cells[0][:, 0]
     used = np.flatnonzero(np.isfinite(level) & (level > 0))
     shape = cells[0][used] / level[used, None]

@@ -37,7 +37,7 @@ def fit_noise(
 
     so they follow from non-negative generalised least squares, averaged over the submodels of Q,
     N, B and K with their likelihoods as weights. R is the trend of the window. The covariance
-    between averaging times (overlapping estimates share data) is that of the fitted noise, found by
+    between averaging times (overlapping estimates share data) is computed from the fitted noise, by
     iteration. Where gaps required weighted cluster means, the columns of Q, N and R are predicted
     from the mask.
 

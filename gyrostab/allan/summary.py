@@ -28,7 +28,7 @@ _MIN_TAU_RATIO = 10.0
 #: Twice the rotation rate of the Earth, 15.041 deg/h: the largest change of the mean rate that a
 #: change of attitude at rest can cause.
 _MAX_CHANGE_AT_REST_DPH = 30.082
-#: Largest median over the windows of the scatter next to gaps over that elsewhere that is not
+#: Largest ratio of the scatter next to gaps to that elsewhere (median of the windows) that is not
 #: reported: at least 1.7 standard deviations in a record of one window with few gaps.
 _MAX_EDGE_RATIO = 1.25
 
@@ -303,7 +303,7 @@ def _describe_misfit(product: xr.Dataset) -> list[str]:
         line = f"The terms do not describe {', '.join(failing)}; no term counts as observed there"
         start = find_fit_from(product)
         if start:
-            remedy = f"they do from {start:g} s on: fit again with tau_min (--fit-from) {start:g}s"
+            remedy = f"they do above {start:g} s: fit again with tau_min (--fit-from) {start:g}s"
         elif not any(fit.fails for fit in summarise_fit(_without_outliers(product))):
             remedy = "these windows hold outliers, which no tau_min (--fit-from) removes"
         else:
@@ -317,7 +317,7 @@ def _describe_misfit(product: xr.Dataset) -> list[str]:
 
 def _describe_filter(product: xr.Dataset) -> list[str]:
     filtered = [
-        f"{fit.axis} below {_number_text(fit.tau_min)} s (as by a low-pass with a time constant of "
+        f"{fit.axis} below {_number_text(fit.tau_min)} s (like a low-pass with a time constant of "
         f"{_number_text(fit.filter_time_constant)} s)"
         for fit in summarise_fit(product)
         if fit.filter_time_constant > 0
@@ -326,7 +326,7 @@ def _describe_filter(product: xr.Dataset) -> list[str]:
         return []
     return [
         f"Averaging times at which a filter shapes the noise are left out: {', '.join(filtered)}. "
-        "N, B and K are those of the noise without the filter; Q is not observable."
+        "N, B and K describe the noise without the filter; Q is not observable."
     ]
 
 
@@ -363,7 +363,8 @@ def _describe_losses(product: xr.Dataset) -> list[str]:
         present = float(np.median(part["window_coverage"].values[judged]))
         if ratio > _MAX_EDGE_RATIO:
             low = 1.0 - 1.0 / np.sqrt(present + (1.0 - present) * ratio**2)
-            affected.append(f"{axis} {_number_text(ratio)} times (N may be {100 * low:.0f} % low)")
+            too_low = f"N may be too low by {100 * low:.0f} %"
+            affected.append(f"{axis} {_number_text(ratio)} times ({too_low})")
     if not affected:
         return []
     return [

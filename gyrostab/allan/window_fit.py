@@ -100,7 +100,7 @@ class FitTables:
 
 
 def quantile_curve(level: float) -> tuple[Floats, Floats]:
-    """Tabulate the quantile q at `level` of chi-square over its degrees of freedom nu.
+    """Tabulate the quantile q at `level` of chi-square per degree of freedom nu.
 
     Returns ln nu and ``nu ln q`` for `chi_square_quantile`. A step of 0.005 in ln nu leaves a
     relative error of q below 1e-5.

@@ -69,7 +69,8 @@ class Reading:
     strict
         Stop at a damaged or missing file instead of leaving a gap.
     time_from
-        Use the log from this time on: 2026-11-20T14:00 (UTC), or a duration after its start, 10min.
+        Use the log only after this time: 2026-11-20T14:00 (UTC), or a duration after its start,
+        10min.
     time_to
         Use the log up to this time, given like --from.
     exclude

@@ -272,7 +272,7 @@ def _judge_coupling(entry: dict[str, Any], twin: dict[str, Any] | None) -> str:
 
     `twin` is the coupling with the rate of change of the same channel, or with the channel of the
     same rate of change, if these are the only drivers. Where the record does not tell both apart,
-    the one with the shorter lag is the plainer explanation.
+    the one with the shorter lag is the simpler explanation.
     """
     if entry["limits"] & {"constant", "too_few", "clusters"} or not np.isfinite(entry["p_search"]):
         return "cannot_tell"

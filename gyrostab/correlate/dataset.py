@@ -154,9 +154,9 @@ def _limit_flags(
 
 
 def join(product: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
-    """Merge product and correlation; a variable that both hold is that of the product.
+    """Merge product and correlation; a variable that both hold is taken from the product.
 
-    An earlier correlation in the product is replaced, also the series of its file.
+    An earlier correlation in the product is replaced, including the series of its file.
     """
     replaced = [
         name

@@ -252,7 +252,7 @@ def format_correlation(result: xr.Dataset) -> str:
         for row in table
     ]
     note = (
-        "Lag, sensitivity and interval are those of the best-fitting lag; "
+        "Sensitivity and interval are given at the best-fitting lag; "
         "p adjusted is for the whole search."
     )
     lines += [note, ""] if shown else []

@@ -47,7 +47,7 @@ class Settings:
         "blocks that a motion may move, evidence that a filter leaves of a line, variance of "
         "a switching course that another effect explains, Q^2 of an angle counter, equal share of "
         "what several effects explain of a mismatch, correlation of a time-shifted surrogate with "
-        "its channel, amplitude at the averaging times of a region over the largest.",
+        "its channel, amplitude at the averaging times of a region divided by the largest.",
         "nearer to the whole than to nothing; no other value separates two alternatives equally",
     )
     component_nats: float = _make_setting(
@@ -127,7 +127,7 @@ class Settings:
         0.999,
         "1",
         "Correlation of the errors of two terms above which the data do not separate them.",
-        "standard errors grow by 1 / sqrt(1 - r^2) = 22 over those of one term",
+        "standard errors are 1 / sqrt(1 - r^2) = 22 times those of one term",
     )
     fast_blocks: float = _make_setting(
         2.0,
@@ -189,8 +189,8 @@ class Settings:
     step_power_ratio: float = _make_setting(
         5.0,
         "1",
-        "Squared step of the mean times the length of a block, over the noise density of its "
-        "lowest band, above which the mean moves within the block.",
+        "Squared step of the mean times the length of a block, divided by the noise density of "
+        "its lowest band, above which the mean moves within the block.",
         "a step of D within T seconds adds D^2 T / pi^2 to the density at 1 / T: half of the noise",
     )
     rest_sigma: float = _make_setting(
@@ -208,8 +208,8 @@ class Settings:
     max_moving_share: float = _make_setting(
         2.0 / 3.0,
         "1",
-        "Largest share of the blocks that an axis may move if its level at rest is that of the "
-        "closest quarter of the means; otherwise it is that of the steadiest stretch.",
+        "Largest share of the blocks in which an axis may move if its level at rest is taken from "
+        "the closest quarter of the means; otherwise the steadiest stretch gives the level.",
         "choice: a third at rest contains the quarter",
     )
     motion_margin_blocks: int = _make_setting(
@@ -235,7 +235,7 @@ class Settings:
     calm_ratio: float = _make_setting(
         2.0,
         "1",
-        "Vibration or rotation over its level at rest, up to which a block is quiescent.",
+        "Ratio of vibration or rotation to its level at rest up to which a block is quiescent.",
         "choice: noise by rectification is then 4 times that at rest",
     )
     calm_slope_share: float = _make_setting(
@@ -265,7 +265,7 @@ class Settings:
         0.25,
         "1",
         "Share of the blocks that must be quiescent; below it the quietest are taken.",
-        "choice: N from a quarter of a record is known twice as badly as from the whole",
+        "choice: the error of N from a quarter of a record is twice that from the whole",
     )
     min_quiescent_blocks: int = _make_setting(
         16,
@@ -330,7 +330,7 @@ class Settings:
         100.0,
         "null record",
         "Weight of the variance over windows of one length in the variance of a cell.",
-        "choice: from as many records the own variance of a cell is known to sqrt(2 / n) = 14 %",
+        "choice: as many records give the variance of a single cell to sqrt(2 / n) = 14 %",
     )
     # regions of mismatches
     window_sum_share: float = _make_setting(
@@ -354,9 +354,10 @@ class Settings:
     line_tau_ratio: float = _make_setting(
         4.0,
         "1",
-        "Averaging time over that at which the Allan variance of a line is largest, up to "
-        "which the line shows.",
-        "that of a sine, sin(x)^4 / x^2, falls to 0.09 of its largest value above, to 0.15 below",
+        "Ratio of the averaging time to that at which the Allan variance of a line is largest, "
+        "up to which the line shows.",
+        "the variance of a sine, sin(x)^4 / x^2, falls to 0.09 of its largest value above, to 0.15 "
+        "below",
     )
     line_width_share: float = _make_setting(
         0.02,
@@ -368,7 +369,7 @@ class Settings:
         3,
         "region",
         "Regions of the mean of an axis beyond which its mean wanders.",
-        "choice; one mismatch that wanders takes the place of many",
+        "choice; one mismatch of a wandering mean replaces many",
     )
     # attribution of mismatches to effects, and verdict
     active_share: float = _make_setting(

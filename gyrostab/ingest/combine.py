@@ -366,7 +366,7 @@ def drop_repeats(
     """Drop the rows of each file that repeat rows of other files, with notes.
 
     Two files overlap if rows of both have the same stamps and the same values. Files whose clocks
-    merely cover the same hours, as after a restart of the clock, have other values and stay
+    merely cover the same hours, for instance after a restart of the clock, differ and stay
     unchanged. `parts` are in the order of their first stamps. A file without new rows is dropped as
     a whole. The notes are in the file that contains the rows.
 

@@ -47,7 +47,7 @@ def as_log(data: Any, *, converts_units: bool = True) -> xr.Dataset:
     Parameters
     ----------
     data : xarray.Dataset, xarray.DataArray, pandas.DataFrame or pandas.Series
-        A log, also after xarray operations (see `gyrostab.ingest.uniform.as_uniform`); a signal
+        A log, even after xarray operations (see `gyrostab.ingest.uniform.as_uniform`); a signal
         with units on ``time`` or ``(axis, time)``; a table with a DatetimeIndex and units in the
         names of its columns or in ``attrs["units"]``.
     converts_units : bool

@@ -59,7 +59,7 @@ def from_dataframe(
         ...), with a DatetimeIndex (UTC, or with a time zone) that does not run backwards. Samples
         may be missing.
     units : str or mapping, optional
-        Unit of all gyro columns (``"deg/s"``), also of angles (``"deg"``), or units by column
+        Unit of all gyro columns (``"deg/s"``), or of angles (``"deg"``), or units by column
         (``{"gyro": "deg/s", "temperature": "degC"}``). By default those in the names of the columns
         (``"gyro_x [deg/s]"``), or in ``df.attrs["units"]``.
     map : mapping, optional
@@ -75,7 +75,7 @@ def from_dataframe(
     -------
     xarray.Dataset
         ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree], channels and table
-        of gaps, as from `gyrostab.regularise`.
+        of gaps, such as `gyrostab.regularise` returns.
 
     Raises
     ------

@@ -111,7 +111,7 @@ def read_log(
     Raises
     ------
     FormatError, UnitError, OptionError, TimeError
-        With file, position, what is wrong and what to do. `FormatError` also when more than half of
+        With file, position, what is wrong and what to do. `FormatError` also if more than half of
         the files cannot be read.
 
     Examples

@@ -187,7 +187,7 @@ def _inspect_once(
 def _try_guess(
     path: Path, inspection: FileInspection, guess: Guess, reading: dict[str, Any]
 ) -> InspectedFile:
-    """Read a file by the guess, also with its mean rate if many samples seem to be missing."""
+    """Read a file by the guess, and with its mean rate too if many samples seem to be missing."""
     axes = guess.axes.items()
     mapped = {column.key: f"gyro_{axis}" for axis, column in axes if column.role != "gyro"}
     if guess.time is not None and guess.time.role != "time":
@@ -240,7 +240,7 @@ def add_channels(options: dict[str, Any], inspected: Sequence[InspectedFile]) ->
 
 
 def _select_reading(options: dict[str, Any]) -> dict[str, Any]:
-    """Return the options that are those of `ReadOptions`."""
+    """Return the options that belong to `ReadOptions`."""
     return {name: value for name, value in options.items() if name not in _PLACING}
 
 

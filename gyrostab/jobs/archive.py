@@ -158,7 +158,7 @@ def _find_kind(folder: Path, names: set[str]) -> str:
 
 
 def _is_diagnosis(folder: Path) -> bool:
-    """Whether gyrostab wrote the diagnosis in a folder, also if it is damaged further on."""
+    """Whether gyrostab wrote the diagnosis in a folder, even if a later part is damaged."""
     try:
         return SCHEMA.encode() in read_bytes(folder / "diagnosis.json", _SCHEMA_BYTES)
     except OSError:
@@ -277,7 +277,7 @@ def find_runs(
 ) -> list[LogRun]:
     """Group the logs of an archive, in a table of `index_files`, into runs, sorted by name.
 
-    The options are those of `gyrostab.jobs.fleet.run_fleet`.
+    The options are the same as in `gyrostab.jobs.fleet.run_fleet`.
 
     Raises
     ------

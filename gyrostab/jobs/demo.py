@@ -1,4 +1,4 @@
-"""The whole analysis of the shipped log: a gyro warms up, rests, is shaken, and rests again."""
+"""The whole analysis of the shipped log: warm-up, rest, vibration, and rest again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gyrostab.progress import Stage, no_stage
 
 WINDOW, STEP = "4h", "30min"
 #: Parts of the record, which ``data/models/demo.toml`` describes: begin and end [h].
-PARTS = {"warming up": (0, 6), "at rest": (6, 12), "shaken": (12, 18), "at rest again": (18, 24)}
+PARTS = {"warm-up": (0, 6), "rest": (6, 12), "vibration": (12, 18), "rest again": (18, 24)}
 FILES = (
     "product.nc",
     "log.nc",

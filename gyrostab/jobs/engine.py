@@ -72,7 +72,7 @@ def compute_blocks(
     Parameters
     ----------
     blocks : dict
-        Finished parts; computed parts are added, also when an error follows.
+        Finished parts; computed parts are added, even if an error follows.
     call : sequence
         Function and its first arguments; the part is the last one.
     check : callable

@@ -90,10 +90,10 @@ def write_file_table(
 ) -> pd.DataFrame:
     """Write the table of the files of an archive, which `run_fleet` takes in place of the archive.
 
-    The table is that of `gyrostab.jobs.archive.index_files`, in a Parquet file, which may be at an
+    The table of `gyrostab.jobs.archive.index_files` is stored in a Parquet file, which may be at an
     address. An earlier table of the same archive and options is brought up to date: files that have
     not changed are not opened again, except with `overwrite`, which replaces any table of files.
-    The other options, and errors, are those of `run_fleet`.
+    The other options, and the errors, are the same as in `run_fleet`.
     """
     scheduler = check_scheduler(scheduler)
     known_table = read_table(Path(output), content=FILES)
@@ -158,7 +158,7 @@ def run_fleet(
     reports : bool
         Whether each run gets a report.
     overwrite : bool
-        Compute all runs again, also with other options or for another archive. The table then has
+        Compute all runs again, even with other options or for another archive. The table then has
         the runs of this call only.
     scheduler : str
         ``processes``, the address of a dask.distributed scheduler, whose workers must see the
@@ -329,7 +329,7 @@ def _is_current(
     options: Mapping[str, Any],
     reports: bool,
 ) -> bool:
-    """Whether row, product and report of a run are those of its files and options."""
+    """Whether row, product and report of a run were made from its files with its options."""
     if row is None or row["error"]:
         return False
     if reports and not (row["report"] and exists(target / str(row["report"]))):

@@ -1,4 +1,4 @@
-"""The output of a fleet: its folder, or groups of a Zarr store, also at an address."""
+"""The output of a fleet: its folder, or groups of a Zarr store, local or at an address."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def check_update(
 ) -> None:
     """Check that an earlier output is of this archive and these options, to bring it up to date.
 
-    Files that are gone, or new, are those of the same archive.
+    Files that are gone, or new, still belong to the same archive.
 
     Raises
     ------

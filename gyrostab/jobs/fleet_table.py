@@ -36,7 +36,7 @@ _TERMS = tuple(f"{symbol}_" for symbol in LAWS)
 TREND_COLUMNS = ("tool", "quantity", "against", "runs", "slope", "low", "high", "p_value")
 #: Kendall's test of fewer runs cannot reject at 5 %: its smallest p-value is 2 / n!.
 _MIN_TREND_RUNS = 5
-#: Largest number of runs in a trend; more are thinned evenly, as slopes are those of all pairs.
+#: Largest number of runs in a trend; more are thinned evenly, because every pair has a slope.
 _MAX_TREND_RUNS = 1000
 
 
@@ -240,7 +240,7 @@ def list_effects(table: pd.DataFrame) -> pd.DataFrame:
 def find_trends(table: pd.DataFrame, effects: pd.DataFrame) -> pd.DataFrame:
     """Find how coefficients and sizes of effects change with age and temperature, by tool.
 
-    Each run is one point. Slopes are those of Theil and Sen, tests those of Kendall, which need no
+    Each run is one point. Theil-Sen slopes and Kendall's rank tests need no
     error of a point and resist outliers.
 
     Returns

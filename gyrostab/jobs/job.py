@@ -95,7 +95,7 @@ def describe_inputs(paths: Sequence[Path]) -> list[dict[str, Any]]:
 def make_fingerprint(paths: Sequence[Path], options: Mapping[str, Any]) -> dict[str, Any]:
     """Collect all that a product depends on: inputs in order, options, versions and machine.
 
-    The options are those of `gyrostab.jobs.load.check_options`; fitting is None without a fit.
+    `gyrostab.jobs.load.check_options` describes the options; fitting is None without a fit.
     """
     plain = {**options["reading"], **options["windows"]}
     plain |= {f"fit {name}": value for name, value in (options["fitting"] or {}).items()}
@@ -202,7 +202,7 @@ def _format_change_time(item: Mapping[str, Any]) -> str:
 def lock_job(folder: Path) -> Iterator[None]:
     """Lock a job folder for this process; make it if it does not exist.
 
-    The lock ends with the process, also when it is killed.
+    The lock ends with the process, even if it is killed.
 
     Raises
     ------

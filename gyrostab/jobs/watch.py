@@ -63,7 +63,7 @@ class Listener(Protocol):
     """Receives what a live view finds."""
 
     def show_window(self, window: Mapping[str, Any]) -> None:
-        """Receive a new window, as from `gyrostab.jobs.alarms.describe_windows`."""
+        """Receive a new window, as `gyrostab.jobs.alarms.describe_windows` returns it."""
 
     def show_alarm(self, event: Mapping[str, str]) -> None:
         """Receive the begin or end of an alarm: ``time``, ``state`` and ``text``."""
@@ -95,7 +95,7 @@ def watch(
 ) -> Path:
     """Follow growing logs, and append each window to a Zarr product once it is complete.
 
-    The product is that of `gyrostab.jobs.run.run` over the same rows, bit for bit.
+    The product equals that of `gyrostab.jobs.run.run` on the same rows, bit for bit.
 
     Parameters
     ----------

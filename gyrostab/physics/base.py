@@ -38,7 +38,7 @@ __all__ = [
 Stage = Literal["motion", "noise", "rate", "sensor", "electronics", "sampling", "logger"]
 
 #: When another effect looks like an effect: "always"; "any spectrum", if their spectra may have any
-#: form; "limit", at the end of the range of a parameter, where the other is the plainer one;
+#: form; "limit", at the end of the range of a parameter, where the other is the simpler one;
 #: "single event", if it happens once; "size", if only the size of a step tells them apart.
 Likeness = Literal["always", "any spectrum", "limit", "single event", "size"]
 
@@ -58,7 +58,7 @@ class Parameter:
     high: float = math.inf
     choices: tuple[str, ...] = ()  # allowed words of a text parameter
     many: bool = False  # whether it has one number per axis; see `Effect.expand_to_axes`
-    difference: bool = False  # whether it is a difference of two values, as of temperatures
+    difference: bool = False  # whether it is a difference of two values, such as temperatures
     #: What the value must be, "whole number" or "whole number of fringes"; empty for any number.
     whole: str = ""
     source: str = "estimate"  # source of the typical size: author and year, or "estimate"

@@ -211,7 +211,7 @@ class Telegraph(Effect):
     shapes_spectrum = True
 
     step: tuple[float, ...] = parameter(
-        "deg/h", "upper level over the lower", typical=(0.1,), limit=1e9, many=True
+        "deg/h", "upper level above the lower", typical=(0.1,), limit=1e9, many=True
     )
     low: float = parameter(
         "s", "mean time at the lower level, where the bias is 0", default=100.0, low=1e-3, high=1e9

@@ -33,7 +33,7 @@ class LoggerFilter(Effect):
     `oversampling` of the model; what passes the filter above half of the log's rate is then
     aliased. All filters are causal and keep their state between chunks. With ``instrument = 1`` the
     filter acts on the samples of the log instead. With 0, n is the oversampling of a model, and 16
-    to explain a recording, as of a fast instrument.
+    to explain a recording, for instance of a fast instrument.
 
     References
     ----------

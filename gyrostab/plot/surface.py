@@ -235,7 +235,7 @@ def _merge_windows(
 
 
 def _divide_by_median(deviation: Array) -> Array:
-    """Divide by the median over time; NaN where that is zero, as of a constant signal."""
+    """Divide by the median over time; NaN where that is zero, as for a constant signal."""
     cells = pd.DataFrame(deviation)
     median = cells.median()
     return (cells / median.where(median > 0.0)).to_numpy()

@@ -200,7 +200,7 @@ def _list_facts(product: xr.Dataset) -> list[tuple[str, str]]:
         for name, label in plain.items()
         if name in attrs
     ]
-    labels = ("no estimate", "from complete clusters", "from incomplete (weighted) clusters")
+    labels = ("no estimate", "from complete differences", "from incomplete (weighted) clusters")
     estimator = product["estimator"].values
     shares = [
         f"{label}: {format_share(float(np.mean(estimator == number)))}"

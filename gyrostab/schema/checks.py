@@ -150,7 +150,7 @@ def require_dataset(dataset: Any, kind: str) -> None:
 
 
 def refuse_multi_index(data: xr.Dataset | xr.DataArray, kind: str) -> None:
-    """Raise `SchemaError` where a MultiIndex of xarray takes the place of axis or time."""
+    """Raise `SchemaError` where a MultiIndex of xarray replaces axis or time."""
     for dim, index in data.xindexes.items():
         levels = (
             list(map(str, index.index.names))
@@ -288,7 +288,7 @@ def _check_units(dataset: xr.Dataset, name: str) -> None:
 
 
 def with_axis(product: xr.Dataset) -> xr.Dataset:
-    """Return a surface or product with its dimension ``axis``, also after ``.sel(axis="x")``."""
+    """Return a surface or product with its dimension ``axis``, even after ``.sel(axis="x")``."""
     if not isinstance(product, xr.Dataset) or "axis" not in product or product["axis"].ndim:
         return product
     names = [name for name in VARIABLES if name in product.data_vars]

@@ -101,7 +101,7 @@ VARIABLES: dict[str, dict[str, Any]] = {
         "gaps"
     ),
     "outlier_count": _make_attrs("single samples of the window that are far from both neighbours"),
-    "gap_edge_ratio": _make_attrs("scatter of the samples next to gaps over that of the others"),
+    "gap_edge_ratio": _make_attrs("scatter of the samples next to gaps divided by that elsewhere"),
     "window_coverage": _make_attrs("share of the window's samples that are present"),
     "observable": {
         "long_name": "whether the window shows the noise term",

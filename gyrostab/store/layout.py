@@ -211,7 +211,7 @@ def find_hdf5_codecs(plist: Any) -> tuple[tuple[int, Any], ...]:
 
 @dataclass(frozen=True)
 class _Shuffle:
-    """The shuffle filter; a rest of bytes at the end, as of a checksum, stays unchanged."""
+    """The shuffle filter; remaining bytes, such as a checksum, stay unchanged."""
 
     width: int
 

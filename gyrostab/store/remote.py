@@ -1,7 +1,7 @@
 """Addresses of object stores, such as ``s3://bucket/log.zarr``, which fsspec opens.
 
 pathlib joins the slashes of an address, ``s3:/bucket/log.zarr``; `find_url` restores it, so that
-addresses are paths everywhere else. Credentials and endpoints are those of the environment, as the
+addresses are paths everywhere else. Credentials and endpoints come from the environment, as the
 library of each store reads them.
 """
 

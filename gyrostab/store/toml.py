@@ -9,7 +9,7 @@ from typing import Any
 
 
 def read_toml_text(path: Path) -> str:
-    """Read the text of a TOML file: UTF-8, also with the byte order mark that some editors write.
+    """Read the text of a TOML file: UTF-8, with or without the byte order mark of some editors.
 
     Raises
     ------

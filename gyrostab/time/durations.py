@@ -135,7 +135,7 @@ def samples(value: Any, rate: float, option: str) -> int:
 
 
 def _is_bare_number(value: Any) -> bool:
-    """Whether a length is a number without a unit, also as text.
+    """Whether a length is a number without a unit, or the text of one.
 
     Examples
     --------
@@ -168,7 +168,7 @@ def averaging_factors(
     window : int
         Window [samples].
     tau_max : float or str, optional
-        Longest averaging time, also of a list; by default a third of the terms of the window is
+        Longest averaging time, even of a list; by default a third of the terms of the window is
         left, and a list is used as it is.
     order : int
         Order of the differences: a term spans ``order * k`` samples.

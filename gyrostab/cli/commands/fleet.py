@@ -34,7 +34,7 @@ def index(
 
     When repeated, the command continues its table without --overwrite: files that have not changed
     are not opened again. --overwrite is needed to replace a table of other files or options.
-    gyrostab fleet takes the table in place of the archive, and opens only the logs it computes.
+    gyrostab fleet accepts the table in place of the archive, and opens only the logs it computes.
 
     Example: gyrostab index /archive -o files.parquet
 
@@ -43,7 +43,7 @@ def index(
     archive
         Folders (searched with all their subfolders), files, or quoted patterns.
     output
-        Parquet file to write, also at an address (s3://bucket/files.parquet).
+        Parquet file to write, which may be at an address (s3://bucket/files.parquet).
     scheduler
         Where to open the files: processes, or the address of a dask scheduler.
     """
@@ -81,8 +81,9 @@ def fleet(
     """Analyse many runs: a product for each, a table of all, reports, and an overview page.
 
     The logs of a folder are one run. When repeated, the command continues its output without
-    --overwrite, also after a stop: it computes only runs that are new, have changed or have failed.
-    --overwrite is needed to replace results of other files or options, and computes all runs.
+    --overwrite, even after an interruption: it computes only runs that are new, have changed or
+    have failed. --overwrite is needed to replace results of other files or options, and computes
+    all runs.
 
     Example: gyrostab fleet /archive -o fleet --window 10min
 
@@ -93,7 +94,7 @@ def fleet(
         by gyrostab index.
     output
         Folder to write: products, index.parquet, index.html and reports. FLEET.zarr makes the
-        products groups of a Zarr store, also at an address (s3://bucket/fleet.zarr).
+        products groups of a Zarr store, which may be at an address (s3://bucket/fleet.zarr).
     per
         What a run is: all logs of a folder, or each file.
     tool

@@ -174,7 +174,7 @@ def export(
     Parameters
     ----------
     product
-        File written by gyrostab run or gyrostab fit; for iscwsa also a folder written by gyrostab
+        File written by gyrostab run or gyrostab fit; for iscwsa, also a folder written by gyrostab
         fleet, or a folder of runs in it.
     output
         File or, for zarr, folder to write.

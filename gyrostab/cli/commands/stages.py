@@ -63,7 +63,7 @@ def run(
         One or more logs, in any order: files, patterns (run7/*.csv), addresses, and folders that
         are one log (Zarr, ROS 2 bags).
     output
-        NetCDF file or Zarr store (.zarr) to write; a Zarr store also at an address, s3://...
+        NetCDF file or Zarr store (.zarr) to write; a Zarr store may be at an address, s3://...
     dry_run
         Print the windows and averaging times, estimate time, memory and output size from the first
         part, and write nothing.

@@ -33,7 +33,7 @@ def watch(
 ) -> None:
     """Follow logs that grow: append each window to a Zarr product, and print a line for it.
 
-    The product is bit for bit that of gyrostab run on the rows so far. Ctrl-C writes the last
+    The product equals that of gyrostab run on the rows so far, bit for bit. Ctrl-C writes the last
     windows and ends; the same command continues the product without --overwrite. --overwrite is
     needed to replace a product of another source, of files that are gone, or of other options.
 

@@ -17,11 +17,11 @@ from gyrostab.units import HOUR
 #: above, because too low a limit makes a bias or angle noise of what is their noise.
 MAX_SCATTER = 3.0
 _MIN_MEANS = 4  # to tell K, B and angle noise apart
-#: Variances of angle noise that are tried, over that which makes all of the scatter: less is not
+#: Variances of angle noise that are tried, as shares of one that makes all the scatter: less is not
 #: visible next to white noise.
 _ANGLE_RANGE = 0.03, 3.0
 _SHORT_STEP = 1e-3  # of a logarithm, for gradients; far below any error, above rounding
-_PRIOR_PRECISION = 1e-9  # of effects in the means, over that of one mean; nearly free
+_PRIOR_PRECISION = 1e-9  # of effects in the means, relative to one mean; nearly free
 
 
 class AxisMeans(NamedTuple):

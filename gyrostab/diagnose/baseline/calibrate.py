@@ -268,7 +268,7 @@ def _has_foreign_bands(fit: Fit, settings: Settings) -> bool:
 def _is_foreign(ratio: Floats, weight: Floats, settings: Settings) -> Bools:
     """Return whether the larger part of a power, or of its expected value, is not in the other.
 
-    `ratio` is power over expected power, with a gamma distribution of the shape `weight`.
+    `ratio` is power divided by expected power, with a gamma distribution of the shape `weight`.
     """
     off = np.abs(ratio - 1.0) * np.sqrt(weight) > settings.excess_sigma
     return np.asarray(
@@ -296,7 +296,7 @@ def _keep_explained_bands(fit: Fit, settings: Settings) -> Fit:
 
 
 def _power_ratio(fit: Fit) -> Floats:
-    """Return the powers over those of the noise terms that fit them best."""
+    """Return the powers divided by those of the noise terms that fit them best."""
     return np.asarray(fit.power / (fit.columns @ fit_squares(fit)[0]))
 
 

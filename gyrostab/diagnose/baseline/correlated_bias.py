@@ -48,7 +48,8 @@ _MIN_NOISE_SHARE = 0.05  # of the power of Q and N, that effects may leave; desi
 _SCORING_STEPS = 4  # of Fisher scoring, as in `gyrostab.diagnose.predict.condition`
 _MIN_CHANGE = 1e-6  # of the expected powers, from which effects change them; above rounding errors
 _LEVEL_GROUPS = 30  # of blocks of similar power, where effects change it; limits time
-#: Range of the density of the bias at low frequencies, over that of white noise. Design choice.
+#: Range of the ratio of the low-frequency density of the bias to that of white noise. Design
+#: choice.
 _DENSITY_RATIOS = np.array([0.1, 1e6])
 #: Times at which powers are computed. Between them they are interpolated, to 2e-5 in records of
 #: 10 min to 4 h at 10 and 400 Hz.
@@ -56,8 +57,8 @@ _TIMES = 24
 #: Values of every parameter, evenly spaced in log, from which a search may start. With 9, the
 #: evidence of 16 records changed by 0.06 nats or less.
 _STARTS = 7
-#: K and B without a bias, over those from which a search with it may start. Design choice: where K
-#: and B are hidden, their gradient is zero; a search from there found 3 nats less in one of 16
+#: K and B without a bias, relative to those where a search with it may start. Design choice: where
+#: K and B are hidden, their gradient is zero; a search from there found 3 nats less in one of 16
 #: records.
 _SMALLER = 10.0
 _STEP = 0.05  # of a logarithm, for the curvature of the likelihood by differences
@@ -66,7 +67,7 @@ _STEP = 0.05  # of a logarithm, for the curvature of the likelihood by differenc
 class CorrelatedBias(NamedTuple):
     """A bias that explains the slow noise of an axis best."""
 
-    #: Log Bayes factor over the noise without it, for any rms and time, equally likely in log.
+    #: Log Bayes factor against the noise without it, for any rms and time, equally likely in log.
     nats: float
     rms: float  # degree hour-1
     time: float  # correlation time [s]
@@ -126,7 +127,7 @@ class _AxisRecord:
     def with_scatter_about(self, point: Floats) -> _AxisRecord:
         """Return the record with powers that count less where they scatter more than expected.
 
-        Their scatter about those of these parameters is their deviance over its degrees of freedom,
+        Their scatter about those of these parameters is their deviance per degree of freedom,
         1 for a good fit (McCullagh and Nelder 1989, Generalized Linear Models, sec. 8.3).
         """
         of_powers = float(self.log_likelihoods(point[None])[1, 0])

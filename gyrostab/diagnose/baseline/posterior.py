@@ -235,7 +235,7 @@ def _likelihood_of_powers(
 ) -> tuple[Floats, Floats, Floats]:
     """Compute the log likelihood of the powers for every K and B.
 
-    Returns also the best Q and N, unbounded (point, 2), and their information.
+    The best Q and N are returned too, unbounded (point, 2), and their information.
     """
     free_columns, precision = fit.free()
     weight = fit.weight / spectrum**2

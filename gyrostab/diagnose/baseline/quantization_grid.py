@@ -3,7 +3,7 @@
 Both have the same grid. Rounding the rate to steps s adds an independent error of variance s^2 / 12
 to every sample, which is white. Differences of an angle rounded to steps s dt have errors that the
 next sample takes back: the angle quantization Q = s dt / sqrt(12), which raises the power at the
-highest frequency by s^2 / 3 over the variance of a sample, and which the baseline includes. A
+highest frequency by s^2 / 3 divided by the variance of a sample, and which the baseline includes. A
 rounded rate is therefore reported if the spectrum rules out the Q of a rounded angle. From n
 samples Q^2 is known to about 1 / sqrt(n) of the variance of a sample: with 10^5 of them, a step of
 half their scatter is detectable. A grid whose zero bin is two steps wide is that of a rate
@@ -104,7 +104,7 @@ def _fit_q_square(blocks: xr.Dataset, baseline: xr.Dataset) -> Floats:
 
 
 def angle_share(mean: Array, scatter: float) -> Floats:
-    """Return the Q^2 of an angle counter over that of independent rounding errors.
+    """Return the ratio of the Q^2 of an angle counter to that of independent rounding errors.
 
     The rounding error is uniform; its correlation from one sample to the next is (6 / pi^2) sum
     exp(-2 (pi n s)^2) cos(2 pi n m) / n^2 for normal increments of mean m and standard deviation s

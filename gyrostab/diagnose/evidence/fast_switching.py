@@ -38,7 +38,7 @@ _MAX_MEANS = 12_000  # in the search of a course; sub-blocks are merged beyond; 
 _PARTS_PER_SUB_BLOCK = 64  # each on one level; design choice
 _SURROGATE_RECORDS = 16  # limits time
 _MIN_SAMPLE_SHARE = 0.5  # of a mean that must be present; design choice
-_MIN_WHITE_RATIO = 1e-4  # lowest white variance over the expected one; design choice
+_MIN_WHITE_RATIO = 1e-4  # lowest white variance / expected one; design choice
 _NORMAL_SQUARE_MEDIAN = 0.455  # median of the square of a standard normal variable
 _WHITE_LEVEL_STEP = 1.15  # factor between tried white levels; design choice
 _MAX_PERIODS_PER_SUB_BLOCK = 0.4  # of a wave that sub-blocks resolve; just below Nyquist
@@ -278,7 +278,7 @@ def _slow_noise_grid(baseline: xr.Dataset) -> tuple[Floats, Floats, Floats]:
 def _white_levels(
     courses: TelegraphCourses, values: Floats, variance: Floats, present: Bools
 ) -> Floats:
-    """Return white levels to try, over the expected one; some from differences of neighbours."""
+    """Return relative white levels to try; some from differences of neighbours."""
     pair_present = present[1:] & present[:-1]
     ratios = [1.0, 2.0, 4.0]
     for residual in (values, values - courses.step[0] * courses.share[0]):

@@ -159,7 +159,8 @@ def noise_columns(baseline: xr.Dataset, *, axis: str) -> tuple[Floats, Floats, F
 
     N may take any value; Q changes by its value and error, B and K by three times that, because the
     spectrum cannot fall below what the other terms leave. The error of Q is that of its posterior,
-    which ends at zero: Q cannot explain a spectrum that falls towards its end, as after a filter.
+    which ends at zero: Q cannot explain a spectrum that falls towards its end, for instance after a
+    filter.
 
     Returns
     -------
@@ -190,7 +191,7 @@ class LinearModel(NamedTuple):
     """A linear model of data that are independent from cell to cell."""
 
     values: Floats  # (block, cell, record)
-    weight: Floats  # (block, cell): one over the variance; 0 for no data
+    weight: Floats  # (block, cell): inverse variance; 0 for no data
     designs: list[Floats]  # (block, cell, column) each
     given: Floats  # (block, cell, column): columns in the model with and without a design
     #: (column, column): for the given columns; negative on the diagonal for a nearly free column,

@@ -90,7 +90,7 @@ def axis_noise(baseline: xr.Dataset, axis: str) -> dict[str, Any]:
 
 
 def scale_columns(columns: Floats | None, count: int) -> Floats:
-    """Return columns (count, column) over their largest size, 0 where missing; none for None."""
+    """Return columns (count, column) relative to their largest size, 0 where missing; or None."""
     if columns is None:
         return np.empty((count, 0))
     finite = np.where(np.isfinite(columns), columns, 0.0)
@@ -184,8 +184,8 @@ def remove_common_part(values: Floats, weight: Floats, common: Floats, unit: Flo
     weight`` on the diagonal, plus ``common`` times the product of the units everywhere. Products of
     columns that were transformed here are those of that covariance.
 
-    The values (block, cell, column) are data or designs. The weight (block, cell) is one over the
-    variance that is not common, 0 for no data; `common` (block,) is the variance of the common
+    The values (block, cell, column) are data or designs. The weight (block, cell) is the inverse of
+    the variance that is not common, 0 for no data; `common` (block,) is the variance of the common
     part, and `unit` (block, cell) its size in each cell.
 
     Examples
@@ -274,7 +274,8 @@ def _bounded_evidence(
     """Compute the log marginal likelihoods (design, record) of factors that cannot be negative.
 
     Their prior is the positive half of the normal one. The likelihood changes by the share of the
-    posterior that is positive over that of the prior, each as if the factors were independent.
+    posterior that is positive, divided by that of the prior, each as if the factors were
+    independent.
 
     `rotated` (grid, design, column, record) is ``x' y`` in the frame of the eigenvectors of ``x'
     x``, whose eigenvalues are (grid, design, column); `base` is (record, grid).

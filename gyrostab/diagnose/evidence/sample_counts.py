@@ -20,11 +20,11 @@ EXPECTED = (*COUNTS, "kurtosis")
 GRID_COUNTS = ("repeats", "extremes", "zeros", "stuck", "filled", "kurtosis")
 #: Counts of `GRID_COUNTS` whose number by chance follows from the scatter of normal noise.
 _PREDICTED_COUNTS = ("repeats", "zeros", "stuck", "filled")
-_MAX_PREDICTED_SCATTERS = 1.5  # quantization step over the scatter of these samples; design choice
+_MAX_PREDICTED_SCATTERS = 1.5  # quantization step / scatter of these samples; design choice
 #: Excess kurtosis below which 90 % of the blocks of normal noise are, in standard deviations of
 #: that of independent normal samples, sqrt(24 / n): 1.3, more with correlated ones. Design choice.
 _MAX_NORMAL_KURTOSIS, _NORMAL_SHARE = 2.0, 0.9
-_MIN_COARSE_SCATTERS = 0.2  # quantization step over the scatter of the samples; design choice
+_MIN_COARSE_SCATTERS = 0.2  # quantization step / scatter of the samples; design choice
 _QUIESCENT_QUANTILE = 0.1  # of the block variances, taken as that at rest; design choice
 _CERTAIN_EXTREMES = 2  # the smallest and the largest sample of any record
 # Gamma prior of the factor by which a count is raised: nearly flat over its logarithm.

@@ -49,7 +49,7 @@ START_QUANTILES = ((0.05, 0.95), (0.25, 0.75), (0.05, 0.5), (0.5, 0.95))
 _TRIAL_ROUNDS, _ROUNDS, _FINE_ROUNDS = 3, 14, 60  # of expectation and maximisation; limit time
 _CONVERGED = 0.01  # in white noise deviations, or in the logarithm of a time
 _DRIFT_WAVES = (0, 8)  # slow cosines in the model while the course is searched; design choice
-_HEIGHT_SCATTER = 0.5  # of an arbitrary course over its step; design choice
+_HEIGHT_SCATTER = 0.5  # of an arbitrary course, relative to its step; design choice
 
 
 class TelegraphCourses(NamedTuple):
@@ -62,7 +62,7 @@ class TelegraphCourses(NamedTuple):
     switch_count: Floats  # expected number of switches
     cost: Floats  # of specifying the course [nats]
     log: Floats  # log likelihood of the means, including white noise
-    scale: Floats  # scatter over the expected white variance
+    scale: Floats  # scatter relative to the expected white variance
 
 
 def telegraph_courses(
@@ -78,7 +78,7 @@ def telegraph_courses(
     """Fit biases of two levels in white noise, by expectation-maximisation from several starts.
 
     Only the block means (block, record) [degree hour-1] that are `present` count. `min_scatter` is
-    the lowest scatter over their white variance (block,). The given columns (block, column) have
+    the lowest ratio of scatter to white variance (block,). The given columns (block, column) have
     free sizes; the first one is constant. The levels start at quantiles of the means. A block has
     so many parts, at least `PARTS_PER_BLOCK`.
 

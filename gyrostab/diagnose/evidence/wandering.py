@@ -3,8 +3,8 @@
 Exponentially correlated ones and walks are effects. The angle also has motion that is faster than a
 block: microseisms, waves, the dither of a laser gyro. Its spectrum lies within the blocks, but it
 rarely comes back to the same angle at the end of a block. Every mean has the difference of the
-angles at both ends of its block, over its length; the angle between two blocks is in both means
-with opposite signs. Such noise moves means apart as quantization does, and nothing slow.
+angles at both ends of its block, divided by its length; the angle between two blocks is in both
+means with opposite signs. Such noise moves means apart as quantization does, and nothing slow.
 """
 
 from __future__ import annotations

@@ -88,7 +88,7 @@ def _drop_repeated_power(components: Sequence[Component]) -> list[Component]:
 
 
 def merge_lines(components: dict[str, list[Component]]) -> dict[str, list[Component]]:
-    """Let lines count only for the plainest effect, `spectral_line`.
+    """Let lines count only for the simplest effect, `spectral_line`.
 
     Any line has the form that a ripple of the supply or a sway would have, and does not show its
     cause. These effects are among its alternatives. Their other components count as before.

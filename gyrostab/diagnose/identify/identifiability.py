@@ -87,7 +87,7 @@ def _find_winner(competitors: Iterable[Competitor]) -> tuple[str, float] | None:
 
 
 def find_plainer_effect(components: Sequence[Component], state: State) -> str | None:
-    """Return the effect that explains the same more plainly, or None.
+    """Return the simpler effect that explains the same, or None.
 
     An axis senses a real rotation by the cosine of its angle to it, which is rarely small; errors
     of the scale factor are, and physics excludes large ones.

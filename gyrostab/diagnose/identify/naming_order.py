@@ -80,7 +80,7 @@ def order_rivals(
     state: State,
     examination: Examination,
 ) -> list[str]:
-    """Return the effects that come close to the best, plainer ones first."""
+    """Return the effects that come close to the best, simpler ones first."""
     settings = examination.settings
     best = sum_evidence(components[passing[0]])
     rivals = [

@@ -160,8 +160,8 @@ def _find_span(
 ) -> tuple[float, float, Ints]:
     """Return begin and end of the time about a window that explains most of a column.
 
-    It is the run of the shortest windows with the largest sum over the root of their number. The
-    third result is these windows.
+    It is the run of the shortest windows with the largest sum divided by the root of their number.
+    The third result is these windows.
     """
     first, stop = scores["first"].values, scores["stop"].values
     begin, end = scores["begin"].values, scores["end"].values

@@ -67,10 +67,10 @@ class _NullSetup(NamedTuple):
     baseline: xr.Dataset
     # Shapes of the gamma parts that each band has in common with the first, second, ... above it.
     ties: list[Floats]
-    effects: Floats  # expected power over that of the noise alone
+    effects: Floats  # expected power divided by that of the noise alone
     sd: Floats  # standard deviations of a sample and of a difference of neighbours, by axis
-    # Excess kurtosis of a block beyond that of white Gaussian noise, and its scatter over that of
-    # white Gaussian noise, by axis.
+    # Excess kurtosis of a block beyond that of white Gaussian noise, and the ratio of its scatter
+    # to that of white Gaussian noise, by axis.
     tails: Floats
     shared: _SharedNoise | None  # noise common to axes
 
@@ -370,7 +370,7 @@ def _correlate_lines(drawn: Floats, size: int) -> Floats:
 def _draw_cross(
     setup: _NullSetup, level: Floats, between: Complexes | None, rng: np.random.Generator
 ) -> Complexes:
-    """Return cross-spectra from those over the levels of both axes; independent ones if None."""
+    """Return cross-spectra from those relative to both levels; independent ones if None."""
     first, second = pair_indices(setup.blocks)
     size = np.sqrt(level[:, first] * level[:, second])
     if between is None:
@@ -443,7 +443,7 @@ def _correlation_root(matrix: Array) -> Array:
 def _draw_shared_spectra(
     shared: _SharedNoise, count: int, rng: np.random.Generator
 ) -> tuple[Floats, Complexes]:
-    """Draw powers over their expectation, and cross-spectra over the root of both expectations.
+    """Draw powers relative to expectation, and cross-spectra to the root of both expectations.
 
     The shapes are (record, axis or pair, block, band). They are Wishart distributed, drawn by the
     Bartlett decomposition: as many independent frequencies as the shape of each axis. Samples of
@@ -470,7 +470,7 @@ def _draw_shared_spectra(
 
 
 def _bartlett_factor(axis_shape: Floats, rng: np.random.Generator) -> Complexes:
-    """Return Bartlett's triangular factor (axis, axis, block, band), over the root of the shape."""
+    """Return Bartlett's factor (axis, axis, block, band), divided by the root of the shape."""
     out = np.zeros((len(axis_shape), *axis_shape.shape), np.complex128)
     for row, shape in enumerate(axis_shape):
         out[row, row] = np.sqrt(rng.standard_gamma(np.maximum(shape - row, 0.0)) / shape)

@@ -17,7 +17,7 @@ from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.regression.nonnegative import solve_bounded
 
-#: Least fitted power over the expected one. Design choice.
+#: Least ratio of fitted to expected power. Design choice.
 MIN_POWER_RATIO = 0.2
 
 

@@ -29,7 +29,7 @@ _MIN_RESPONSE = 0.05  # of the largest; below, the power is leakage from other f
 
 
 def _estimate_size(power: Floats, full: Floats) -> float:
-    """Estimate the filter size by the likelihood of powers over those without it, at any level."""
+    """Estimate the filter size by the likelihood of its power ratios, at any level."""
     # Lines do not belong to the shape of the spectrum.
     usual = np.minimum(power, _MAX_LINE_RATIO * local_level(power[None])[0])
     passed = full >= _MIN_RESPONSE * full.max()

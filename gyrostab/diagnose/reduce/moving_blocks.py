@@ -22,7 +22,7 @@ from gyrostab.progress import Stage, no_stage
 #: normal law in standard deviations: 2 * 0.3186.
 CORE_SHARE, CORE_WIDTH_SIGMA = 0.25, 0.637
 MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal law
-#: Scatter of equal means, over the range of the samples, and scatter by errors of rounding alone.
+#: Scatter of equal means, relative to the range of the samples, and that by rounding errors alone.
 #: The means do not move by a few samples that are one quantization step from all others.
 EQUAL_SCATTER, ROUNDING = 1e-3, 1e-9
 REST_ROUNDS = 3  # in which centre and scatter at rest are refined

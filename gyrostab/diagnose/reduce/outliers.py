@@ -306,7 +306,7 @@ def _frequent_levels(levels: Floats, times: Ints, rare: float) -> Floats:
 
 
 def _is_step_of_large_values(levels: Floats, step: float, fine: float) -> bool:
-    """Return whether the larger half of the values has this step, as on a grid of equal steps."""
+    """Return whether the larger half of the values has this step, as on an even grid."""
     distances = np.diff(levels[np.abs(levels) >= np.median(np.abs(levels))])
     large_step = _common_divisor(distances[distances > fine], fine)
     return abs(large_step - step) <= _STEP_ERROR_SHARE * step

@@ -21,7 +21,7 @@ from gyrostab.units import INNER, parse_unit
 HARMONICS = (1, 2, 3)
 #: Turns per block from an order at which its noise is measured.
 _NEIGHBOURS = np.array([-4, -3, -2, -1, 1, 2, 3, 4])
-#: Variance of an amplitude in the samples that are there, over that of an even rotation, 2 / n,
+#: Variance of an amplitude in the samples present, relative to that of an even rotation, 2 / n,
 #: from which a block is not fitted, such as one that lost the samples of a turn. Design choice:
 #: half of the samples determine the amplitude.
 _MAX_VARIANCE_RATIO = 2.0
@@ -101,7 +101,7 @@ def _fit_harmonics(
 ) -> _Harmonics:
     """Fit a constant and harmonics to the samples of each block by least squares.
 
-    Where the rotation is uneven, as in stick-slip, or samples are missing, harmonics are not
+    Where the rotation is uneven (stick-slip), or samples are missing, harmonics are not
     orthogonal: products with each of them would show the first one in all. The variance of an
     amplitude is then larger than with an even rotation: 1.2 times with stick-slip of 0.6 once per
     turn, up to 1.4 times with 0.9.

@@ -206,7 +206,7 @@ BASELINE: dict[str, Variable] = {
     "lines_most": Variable(_LINE, _POWER, "largest power of them at any offset of the frequency"),
     "peaks": Variable(_LINE, _POWER, "expected power of broad peaks"),
     "line_noise": Variable(_LINE, _POWER, "expected power of noise behind a filter"),
-    "line_shape": Variable(_LINE, "1", "that over the power interpolated from the bands"),
+    "line_shape": Variable(_LINE, "1", "ratio of line power to that interpolated from the bands"),
     "line_spectrum": Variable(("axis", "band"), _POWER, "expected power of lines in the bands"),
     "wander_square": Variable(("axis", "wander"), "degree2 hour-2", "variance of a process"),
     "wander_time": Variable(("wander",), "s", "correlation time of a process"),

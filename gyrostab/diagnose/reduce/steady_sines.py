@@ -209,7 +209,7 @@ def sine_factors(ratio: Floats, count: Floats | float) -> Floats:
     times an exponential variable, so that their mean r has the likelihood ratio
     :math:`\exp(n r x / (1 + x)) / (1 + x)^n` for x = E / n. It is averaged over strengths from 3 to
     half a million nats, evenly spaced in log. The ratio is the mean of `count` periodograms of
-    equal noise, over its density.
+    equal noise, relative to its density.
 
     Examples
     --------

@@ -33,9 +33,9 @@ _MIN_SCATTER_STEPS = 2.0  # scatter of values on a grid, of which the most commo
 def bin_widths(values: Floats, step: float) -> tuple[Floats, Floats]:
     """Measure the widths of the zero bin and of its neighbours, in steps, with standard errors.
 
-    The logarithms of the counts of the other bins are a parabola in the rate, as in normal noise.
-    It gives the number of values per step. Both results are in the order of `BINS`, and NaN where
-    not measurable. The grid goes through 0; its step is 0 for none.
+    The logarithms of the counts of the other bins are a parabola in the rate, as they are in normal
+    noise. It gives the number of values per step. Both results are in the order of `BINS`, and NaN
+    where not measurable. The grid goes through 0; its step is 0 for none.
 
     Examples
     --------

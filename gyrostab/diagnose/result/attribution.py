@@ -240,7 +240,7 @@ def _explained_spans(
 ) -> list[tuple[float, float]]:
     """Return the stretches whose mismatches an effect can explain.
 
-    A line locked to the rotation shows also in parts that rotate only a little.
+    A line locked to the rotation also shows in parts that rotate only a little.
     """
     begin, end = blocks["begin"].values, blocks["end"].values
     if any(component.statistic.is_rotation for component in identification.components):

@@ -116,7 +116,7 @@ class Size(_Table):
 
 
 class HeldOutGain(_Table):
-    """What an effect gains on held-out data."""
+    """Evidence of an effect: log Bayes factor [nats], on held-out data or the whole record."""
 
     nats: float
     stderr: NotNegative | None
@@ -219,7 +219,7 @@ class Content(_Table):
 
 
 def check_diagnosis(content: Mapping[str, Any]) -> None:
-    """Raise `SchemaError`, naming the place, unless `content` is that of a `diagnosis.json`.
+    """Raise `SchemaError`, naming the place, unless `content` has the form of a `diagnosis.json`.
 
     Examples
     --------

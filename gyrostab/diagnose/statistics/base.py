@@ -104,7 +104,7 @@ class Statistic:
     has_course = False  # whether designs are by block
     has_size = True  # whether the size follows from a linear model
     uses_line_spectra = False  # whether the score is of the spectrum at full resolution
-    is_ratio = False  # whether the score is of a variance over the expected one
+    is_ratio = False  # whether the score is of a variance divided by the expected one
     grows_in_time = True  # whether adjacent regions of a mismatch are one
     is_tried_last = False  # whether an effect in it explains only what nothing else does
     takes_noise = True  # whether an effect takes a share of the noise of an axis

@@ -45,9 +45,9 @@ class DriftingLine(Statistic):
     def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         r"""Score lines along paths, at another frequency in each part of the record.
 
-        A line of power :math:`E` over the density of the noise in every block, moving over L lines
-        while B blocks pass, is in each line of each of P parts for only B / L blocks. There it
-        raises the mean of B / P blocks by E P / L, which scatters by :math:`\sqrt{P / B}`; the L
+        A line of power :math:`E` relative to the density of the noise in every block, moving over L
+        lines while B blocks pass, is in each line of each of P parts for only B / L blocks. There
+        it raises the mean of B / P blocks by E P / L, which scatters by :math:`\sqrt{P / B}`; the L
         cells of its path together exceed noise by :math:`E \sqrt{P B / L}` standard deviations.
         Paths begin anywhere, cover 4 lines or more in either direction, and accelerate or slow down
         by up to a half of their mean speed. The largest sum from one eighth of the spectrum to

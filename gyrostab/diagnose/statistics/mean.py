@@ -139,8 +139,8 @@ class Mean(BlockMeanStatistic):
 
         The score is that of a constant added only in the window, by generalised least squares with
         the noise of the simulation and a constant of the record. For white noise it is the window's
-        mean minus that of the rest, over its standard deviation; for slow noise, neighbours count
-        more. ``estimate`` is the constant [degree hour-1].
+        mean minus that of the rest, divided by its standard deviation; for slow noise, neighbours
+        count more. ``estimate`` is the constant [degree hour-1].
         """
         windows = window_set(blocks.sizes["block"], LENGTHS, whole=False)
         amount, information = window_means(blocks, baseline, windows)

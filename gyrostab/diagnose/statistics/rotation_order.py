@@ -193,7 +193,7 @@ def is_reversed(component: Component) -> bool:
 
 
 def order_weight(state: State) -> Array:
-    """Return (axis, block, harmonic): one over the variance of each part of an amplitude."""
+    """Return (axis, block, harmonic): inverse variance of each part of an amplitude."""
     blocks = state.blocks
     rate, frequency = float(blocks.attrs["sampling_rate_hz"]), blocks["frequency"].values
     place = turns_per_second(blocks)[:, None] * blocks["harmonic"].values

@@ -61,7 +61,7 @@ _MAX_BLOCK_SIGMA = 4.0  # of the kurtosis of one block: the counts judge single 
 _MIN_SCATTER = (0.35, 0.35, 0.35, 0.35, 0.2)
 #: Standard deviations in a quantization step from which the values have few levels. Design choice.
 COARSE_STEP_SIGMA = 1.5
-_FINE_STEP = 0.3  # over the scatter of differences; the next term is 3e-5 of the probability there
+_FINE_STEP = 0.3  # / scatter of differences; the next term is 3e-5 of the probability there
 _QUADRATURE_NODES = 12  # over a bin: exact to 1e-6 up to 4 standard deviations of a step
 _MAX_LEVELS = 400  # on either side of the mean; more than any step above `_FINE_STEP` needs
 _MAX_CORRELATION = 0.9999

@@ -166,9 +166,9 @@ def _size_spikes(
 ) -> dict[str, tuple[float, ...]]:
     """Return how often outliers occur, and their size, with intervals of positive quantities.
 
-    The number is that of the outliers seen, over the share of a normal law that is seen. Their true
-    law is unknown: the logarithm of that share has an error of half its size, so that the interval
-    begins where all outliers are seen.
+    The number is the count of outliers divided by the share of a normal law that is seen. Their
+    true law is unknown: the logarithm of that share has an error of half its size, so that the
+    interval begins where all outliers are seen.
     """
     low, high = _poisson_interval(count)
     relative = 1.0 / math.sqrt(count)
@@ -244,8 +244,8 @@ def _estimate_outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, flo
     """Return the share of outliers seen, their rms size [degree hour-1], and their number.
 
     For a block of n samples of standard deviation s with m outliers of mean square u s^2, and a = m
-    u / n, the fourth moment over the squared second one is about (3 + 6 a + a^2 n / m) / (1 + a)^2,
-    which is solved for a. Only the larger outliers of a normal law are seen, and the standard
+    u / n, the fourth moment divided by the squared second one is about (3 + 6 a + a^2 n / m) / (1 +
+    a)^2, which is solved for a. Only the larger outliers of a normal law are seen, and the standard
     deviation of the law is taken to be at least the smallest one seen: below that, the number of
     those not seen is undetermined.
     """
@@ -276,7 +276,7 @@ def _estimate_outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, flo
     )
     square = float((share * samples[good]).sum() / many.sum())
     limit = MEDIAN_DEPARTURE_SIGMA * outlier_limit(float(samples.sum()))
-    ends = np.geomspace(1.0, 1e-4, 400)  # the least size that is seen, over the rms size
+    ends = np.geomspace(1.0, 1e-4, 400)  # the least size that is seen / the rms size
     seen_squares = (limit / ends) ** 2 * (1.0 + ends * _normal_density(ends) / ndtr(-ends))
     size = limit / float(np.interp(square, seen_squares, ends))
     return float(2.0 * ndtr(-limit / size)), size * math.sqrt(usual), float(many.sum())

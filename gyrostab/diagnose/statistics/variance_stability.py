@@ -43,9 +43,9 @@ class VarianceStability(Statistic):
     def score(self, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset | None:
         r"""Score the scatter of the band powers over time against that of steady noise.
 
-        The powers of a block over the expected ones, averaged over bands and over 1, 2, 4 ...
-        blocks, are the levels :math:`y_j`. In steady noise each is gamma-distributed with a known
-        shape :math:`w_j`, and the statistic of a window of J of them is
+        The ratios of the powers of a block to the expected ones, averaged over bands and over 1, 2,
+        4 ... blocks, are the levels :math:`y_j`. In steady noise each is gamma-distributed with a
+        known shape :math:`w_j`, and the statistic of a window of J of them is
 
         .. math::
 
@@ -57,11 +57,11 @@ class VarianceStability(Statistic):
         average to the next raises Q by :math:`v^2 \sum_j w_j`. It is therefore z standard
         deviations above steady noise if :math:`v^2 = z \sqrt{2 (J - 1)} / \sum_j w_j`: for white
         noise in 100 blocks of 200 samples (w = 93 each) five, if v = 9 %. Averages over k blocks
-        have a variance smaller by the root of k, and lose variations faster than some 3 k blocks.
+        have a variance smaller by the root of k, and lose variations faster than about 3 k blocks.
 
         Each span has a column for each band, each quarter of the bands, all bands, and each band
         against its own mean; the lowest bands are left out, because a moving mean shows in them.
-        ``ratio`` is the scatter over that of steady noise, ``estimate`` the variation of the power,
+        ``ratio`` is the scatter relative to steady noise, ``estimate`` the variation of the power,
         rms over mean. Several axes have a row of all together, the mean of their levels, because
         axes often fluctuate together. None for too short a record.
         """
@@ -154,8 +154,8 @@ def scatter_moments(count: Floats, total: Floats, inverse: Floats) -> tuple[Floa
     """Return mean and variance of the scatter of gamma-distributed levels relative to their mean.
 
     Exact for levels of one scale: their mean is then independent of their ratios (Lukacs 1955), so
-    that the moments of Q are those of the sum of squares over those of the mean. The arguments are
-    the number of levels, the sum of their shapes, and the sum of the inverse shapes.
+    that the moments of Q are those of the sum of squares divided by those of the mean. The
+    arguments are the number of levels, the sum of their shapes, and the sum of the inverse shapes.
 
     Examples
     --------
@@ -185,7 +185,7 @@ def _band_groups(bands: int) -> list[Ints]:
 def _relative_levels(
     blocks: xr.Dataset, baseline: xr.Dataset, used: Bools, members: list[Ints]
 ) -> tuple[list[tuple[Floats, Floats]], list[str]]:
-    """Return the level over that of the record, with its shape, and the axes of each row.
+    """Return the level relative to the record, with its shape, and the axes of each row.
 
     By (record), row, block, group of bands: one pair for all axes, whose shapes all records have in
     common, and one for the row of several axes.

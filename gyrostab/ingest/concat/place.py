@@ -199,7 +199,7 @@ COMPARED_SAMPLES = 2**13
 #: Smallest share of equal samples in a copy, which may be damaged; below the second share at one
 #: end, the other end is not compared.
 _MIN_ALIKE_SHARE, _MIN_HOPEFUL_SHARE = 0.9, 0.5
-#: Largest difference of equal samples, over the median difference of neighbours: files may be
+#: Largest ratio of the difference of equal samples to the median one of neighbours: files may be
 #: rounded differently. Independent noise is that near in 5 % of the samples.
 _MAX_ROUNDING = 0.1
 _PROBED_SAMPLES = 64  # compared samples that are tried at every displacement

@@ -1,6 +1,6 @@
 """ROS 1 bags, ROS 2 bags and MCAP files: the numbers of each topic, ``angular_velocity.x``.
 
-A ROS 2 bag is a folder with ``metadata.yaml``, or a file of it. Stamps are those of the headers of
+A ROS 2 bag is a folder with ``metadata.yaml``, or a file of it. Stamps come from the headers of
 messages, otherwise the times of recording. Units follow from the definitions of the messages.
 
 References
@@ -77,7 +77,7 @@ def _message_time(message: Any) -> int:
 
 
 def _select_numbers(message: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
-    """Yield names and values of the numbers in a message, also of messages within it."""
+    """Yield names and values of the numbers in a message, including messages within it."""
     for field in dataclasses.fields(message):
         value = getattr(message, field.name)
         if isinstance(value, int | float):

@@ -25,7 +25,7 @@ SHARED_SHARE = 0.05
 _BINS, _BINS_PER_PERIOD, _MAX_TABLES = 1 << 15, 4, 64
 _MAX_PEAKS = 3
 #: Shortest period [ticks of the clock]: of a tick all stamps are multiples, however sampled. The
-#: longest tick [ns] that is certainly one, as in stamps in milliseconds.
+#: longest tick [ns] that is certainly one, such as that of stamps in milliseconds.
 MIN_TICKS, _COMMON_TICK = 1.5, 1e6
 PEAK_WIDTH = 0.02  # relative distance of two peaks, at least
 
@@ -274,7 +274,7 @@ def find_by_rows(stretches: Parts, find: Callable[[Parts], _Period]) -> tuple[Pa
     """Return the period [ns] that `find` finds from the stamps, and the stamps that it used.
 
     These are the readable ones. If the period is longer than the mean time per row, few successive
-    rows have one, as where only the first row of a packet has; all rows are used then.
+    rows have one, for instance the first row of each packet; all rows are used then.
     """
     parts = [readable_stamps(stretch) for stretch in stretches]
     period = find(parts)

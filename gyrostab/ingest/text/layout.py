@@ -217,7 +217,7 @@ def _decode_lines(path: Path, head: bytes, *, complete: bool) -> tuple[list[str]
         )
     if b"\n" not in head and b"\r" in head.rstrip():
         raise FormatError(
-            f"{path.name}: its lines end with CR alone, as on old Macs; convert it: tr '\\r' '\\n'"
+            f"{path.name}: its lines end with CR alone (old Macs); convert it: tr '\\r' '\\n'"
         )
     if not is_text(
         head[:4096]

@@ -78,7 +78,7 @@ def _make_fit():  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _fit_diagonal(cells, weight, allowed, fit):  # type: ignore[no-untyped-def]
-    """Fit with a diagonal covariance, ``y^2`` over the degrees of freedom of white noise.
+    """Fit with a diagonal covariance, ``y^2`` divided by the degrees of freedom of white noise.
 
     No noise falls faster than quantization noise. A cell below that fall from a shorter averaging
     time is low by chance, and must not get the weight that its square implies.

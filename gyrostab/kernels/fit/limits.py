@@ -89,7 +89,7 @@ def estimate_bounds(estimate, null, linear, square, scores):  # type: ignore[no-
 
 
 def chi_square_quantile(freedom: Floats, quantile: tuple[Floats, Floats]) -> Floats:
-    """Interpolate the quantile q of chi-square over its degrees of freedom nu.
+    """Interpolate the quantile q of chi-square per degree of freedom nu.
 
     `quantile` has the nodes ln nu and ``nu ln q(nu)``, which is smooth from few degrees of freedom
     to many; nu must not be above the last. Zero below the table, where q is below the smallest

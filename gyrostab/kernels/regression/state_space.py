@@ -3,7 +3,7 @@
 The bias is a random walk from an unknown start (the free constant), plus Ornstein-Uhlenbeck
 processes, plus white noise, plus the rate of white noise in the angle. The observations are means
 over consecutive blocks, so the moments are those of means, not of points. Angle noise adds the
-difference of the angles at both ends of a block, over its length: two blocks that meet have one
+difference of the angles at both ends of a block by its length: two adjacent blocks have one
 angle in common, and means that add it with opposite signs.
 """
 

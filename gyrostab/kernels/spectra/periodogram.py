@@ -8,9 +8,9 @@ With a = w m, A = FFT(a), V = FFT(a^2) and n samples present, white noise of var
 
     E |F_k|^2 = s (V_0 - |A_k|^2 / n),    cov(F_k, F_l) = s (V_(k-l) - A_k conj(A_l) / n),
 
-and E F_k F_l follows with -l for l. The power of a band, the sum of |F_k|^2 over the sum of their
-expectations, is therefore unbiased with any gaps, and its variance gives the shape of its gamma
-distribution.
+and E F_k F_l follows with -l for l. The power of a band, the sum of |F_k|^2 divided by the sum of
+their expectations, is therefore unbiased with any gaps, and its variance gives the shape of its
+gamma distribution.
 """
 
 from __future__ import annotations

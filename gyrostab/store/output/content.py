@@ -23,7 +23,7 @@ UNFINISHED = re.compile(r"\.[0-9a-f]{32}\.partial$")
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file, also at an address; None when it cannot be read."""
+    """Read a JSON file, local or at an address; None if it cannot be read."""
     try:
         content = read_bytes(path)
         return json.loads(content.decode(json.detect_encoding(content)))

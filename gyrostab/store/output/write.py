@@ -228,7 +228,7 @@ def _hide_name(name: str) -> str:
 
 
 def is_leftover(name: str) -> bool:
-    """Whether a file name is that of an incomplete output.
+    """Whether a file name marks an incomplete output.
 
     Examples
     --------
