@@ -156,7 +156,7 @@ def _draw_panel(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> No
 
 
 def _verdict_text(verdict: str, lag: float, p: float) -> str:
-    """Write the title of a panel; the p-value only where it is that of the verdict."""
+    """Write the title of a panel; the p-value only if it belongs to the verdict."""
     late = f", {lag:.3g} s late" if lag else ""
     if verdict == "cannot_tell":
         return "cannot tell"

@@ -196,7 +196,7 @@ def _advise_dimensions(has: tuple[Hashable, ...], expected: tuple[str, ...]) -> 
         order = ", ".join(map(repr, expected))
         return f"call .transpose({order}, ...), or open a file with engine='gyrostab'"
     if not extra:
-        return f"keep the dimension {lost[0]!r}, also to select one: .isel({lost[0]}=[0])"
+        return f"keep the dimension {lost[0]!r}, even to select one label: .isel({lost[0]}=[0])"
     if not lost:
         return (
             f"if datasets were concatenated along {extra[0]!r}, give xarray.concat "

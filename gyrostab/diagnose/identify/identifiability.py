@@ -103,7 +103,7 @@ def find_plainer_effect(components: Sequence[Component], state: State) -> str | 
 
 
 def _is_rotation(component: Component) -> bool:
-    """Return whether a component is that of an axis that senses the rotation of the tool."""
+    """Return whether a component belongs to an axis that senses the rotation of the tool."""
     return (
         component.candidate.effect == "real_motion"
         and component.statistic.is_linear_in_means

@@ -74,7 +74,7 @@ def plan_columns(
         f"{c.header} is {c.name}" for c in named if c.preset and AXIS_PATTERN.match(c.low)
     ]:
         plan.notes.append(
-            f"taken for axes: {list_some(preset_axes, MAX_HEADERS)}; --map overrules it"
+            f"read as axes: {list_some(preset_axes, MAX_HEADERS)}; --map overrules it"
         )
     if rate is not None:
         plan.options = replace(options, rate=rate)

@@ -99,7 +99,7 @@ def _find_by_content(plan: Plan, named: Sequence[Header]) -> list[Header]:
         candidates = clocks if len(clocks) == 1 else []
         reason = "it is the only column that rises in a unit of time"
     if candidates:
-        plan.notes.append(f"{candidates[0].header!r} is taken for the time column, as {reason}")
+        plan.notes.append(f"{candidates[0].header!r} is read as the time column, because {reason}")
     return candidates
 
 

@@ -158,7 +158,7 @@ def describe_rate(
     if estimate.finer is not None:
         notes.append(
             f"{where}: the stamps lie near multiples of the period of {estimate.finer:g} Hz, as if "
-            "rows of a log at that rate were missing; they are taken for even samples at "
+            "rows of a log at that rate were missing; they are read as even samples at "
             f"{rate:.10g} Hz: if rows are missing, give --rate {estimate.finer:g}"
         )
     off = abs(estimate.raw / rate - 1)

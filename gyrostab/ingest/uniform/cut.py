@@ -189,7 +189,7 @@ class _Clock:
         return sample
 
     def first_at(self, value: Any, option: str, *, example: str = _EXAMPLE) -> int:
-        """Return the first grid sample at or after an instant, also outside the record."""
+        """Return the first grid sample at or after an instant, even outside the record."""
         instant = parse_instant(value, option, example=example)
         if isinstance(instant, float):  # keep it within 64-bit nanoseconds
             instant = min(instant, (self.grid.size + 1) / self.grid.rate)

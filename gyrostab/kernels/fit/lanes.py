@@ -38,7 +38,7 @@ except (ImportError, AttributeError):  # numba or llvmlite has moved what the ve
 
     @njit(**INNER)
     def where_above(x, y, yes, no):  # type: ignore[no-untyped-def]
-        """`yes` where ``x > y``, otherwise `no`, also where x or y is NaN."""
+        """`yes` where ``x > y``, otherwise `no`, even where x or y is NaN."""
         return yes if x > y else no
 
 
