@@ -1,4 +1,4 @@
-"""Measure how often the interval and the limit of each coefficient hold the truth.
+"""Measure how often the interval and the limit of each coefficient hold for the true value.
 
     python benchmarks/fit_coverage.py --output docs/statistics.md
 

@@ -1,4 +1,4 @@
-"""How often the 95 % intervals of a diagnosis contain the truth.
+"""How often the 95 % intervals of a diagnosis contain the true value.
 
 Many records are fitted whose statistics are drawn from their laws.
 
@@ -42,7 +42,7 @@ def identify_effect(reduced, baseline, effect, statistic, column):
 
 
 def held(reduced, baseline, drawn, effect, statistic, column, truth, change):
-    """Return the share of intervals that contain the truth, and the mean relative error."""
+    """Return the share of intervals that contain the true value, and the mean relative error."""
     identifications = identify_effect(reduced, baseline, effect, statistic, column)
     components = list(identifications.identified[0].components)
     inside, ratio = [], []
