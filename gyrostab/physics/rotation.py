@@ -38,7 +38,7 @@ class ScaleFactor(Effect):
     """
 
     name = "scale_factor"
-    short = "error that is a function of the rotation rate"
+    short = "error proportional to (a function of) rotation rate"
     plain = "a scale-factor error"
     next_measurement = (
         "rotate at two known rates in both directions: a scale-factor error is proportional to "

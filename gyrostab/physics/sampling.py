@@ -281,7 +281,7 @@ class ClockError(Effect):
     """
 
     name = "clock_error"
-    short = "sampling clock that is fast, slow or drifting"
+    short = "wrong or drifting rate of time"
     plain = "an error of the clock"
     next_measurement = "log a second clock, or a known frequency such as the mains"
     stage = "sampling"
