@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Floats, Ints
-from gyrostab.correlate.dataset import assemble
+from gyrostab.correlate.dataset import assemble, check_names
 from gyrostab.correlate.drivers import Driver, align_drivers, other_channels
 from gyrostab.correlate.fit import (
     SIGNIFICANCE,
@@ -117,6 +117,7 @@ def correlate(
                 "dates becomes one with .to_xarray().assign_attrs(units=...)"
             )
     drivers = align_drivers(product, channels, lags, step)
+    check_names(drivers)
     other_series = [product[name].values for name in other_channels(product, drivers)]
     series = {
         (a, v): _usable_series(product, name, a)
@@ -195,6 +196,8 @@ def _select_variables(product: xr.Dataset, variables: str | Sequence[str] | None
                 f"variable {name!r} is not in the product by (axis, time); try window_mean, "
                 f"{', '.join(TERMS)}"
             )
+    if len(set(names)) < len(names):
+        raise OptionError(f"the variables {', '.join(names)} are not all different; name each once")
     return names
 
 

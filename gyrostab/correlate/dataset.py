@@ -10,6 +10,7 @@ import xarray as xr
 
 from gyrostab.correlate.drivers import Driver, slope_units
 from gyrostab.correlate.judge import LIMITS, VERDICTS, slope_label
+from gyrostab.errors import OptionError
 from gyrostab.noise import TERMS
 
 # Key of the entry, long name and units of each variable.
@@ -35,6 +36,11 @@ _STATISTICS = {
     "p_value_partial": ("p_partial", "p-value of the sensitivity, given the other drivers", "1"),
     "effective_samples": ("effective", "effective number of independent samples", "1"),
 }
+#: Names of a correlation that no channel may have.
+_RESULTS = {
+    *_STATISTICS,
+    *("windows_used", "coupling_verdict", "coupling_limits", "statement", "variable", "driver"),
+}
 #: Key of the entry, and end of the long name of each number of a sensitivity.
 _SLOPES = {
     "slope": "",
@@ -50,6 +56,15 @@ _SLOPES |= {
     "partial": ", given the other drivers",
     **{f"partial_{key}": f", given the other drivers{_SLOPES[key]}" for key in list(_SLOPES)[1:4]},
 }
+
+
+def check_names(drivers: list[Driver]) -> None:
+    """Raise `OptionError` if a channel has the name of a result, which would replace it."""
+    for name in _RESULTS.intersection(driver.name for driver in drivers):
+        raise OptionError(
+            f"channel {name!r} has the name of a result of the correlation; give it another one, "
+            f"for instance with .rename({name}='other_name') or --map {name}=other_name"
+        )
 
 
 def assemble(

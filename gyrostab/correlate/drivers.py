@@ -15,21 +15,21 @@ from gyrostab.errors import MissingUnitError, OptionError, SchemaError, TimeErro
 from gyrostab.kernels.regression.trend import window_trend
 from gyrostab.schema import is_rate_of_change
 from gyrostab.time.stamps import to_nanoseconds
-from gyrostab.units import HOUR, INNER, parse_unit
+from gyrostab.units import HOUR, INNER, ON_DISK, parse_unit
 
 # A gap is bridged if it is at most as long as a window or this many sample spacings of the channel.
 MAX_GAP_SPACINGS = 3.0
 
-# Names in the denominator of a sensitivity: a difference of temperatures is in kelvin, and UDUNITS
-# takes "g" for the gram.
-_DIFFERENCE_UNITS = {"degree_Celsius": "K", "g": "standard_free_fall"}
 #: A name with its power in a unit: "m", "/s2", "s^-1".
 _POWER = re.compile(r"(/?)\s*([^\s\d/*^.()+-]+)(?:\^|\*\*)?([+-]?\d+)?")
 
 
 @dataclass(frozen=True)
 class Driver:
-    """A channel of the product or a file, or its rate of change (`derived`), by (lag, window)."""
+    """A channel of the product or a file, or its rate of change (`derived`), by (lag, window).
+
+    `of_product` marks a channel that the product holds in the same unit.
+    """
 
     name: str
     label: str
@@ -111,7 +111,7 @@ def _align_channel(
             units,
             mean,
             derived=is_rate_of_change(name, product),
-            of_product=isinstance(channel, str),
+            of_product=isinstance(channel, str) and product[name].attrs["units"] == units,
         ),
         Driver(
             f"{name}_rate",
@@ -126,9 +126,11 @@ def _align_channel(
 def _convert_units(channel: xr.DataArray, expression: str) -> tuple[float, float, str]:
     """Return factor and offset to the inner unit of a channel, and that unit.
 
-    A unit that is not known, such as m/s, is kept.
+    Inner units are kept, and units that are not known, such as m/s.
     """
     text = channel.attrs.get("units")
+    if text in INNER.values():
+        return 1.0, 0.0, str(text)
     if text is None:
         raise MissingUnitError(
             f"channel {str(channel.name)!r} has no units; set them, for instance "
@@ -300,9 +302,13 @@ def _unit_powers(units: str) -> dict[str, int]:
 
 
 def _difference_unit(units: str) -> str:
-    """Give the unit of a difference: kelvin for degrees Celsius."""
-    bare = units.replace("9.80665 m s-2", "g")
-    return " ".join(_DIFFERENCE_UNITS.get(word, word) for word in bare.split())
+    """Give the unit of a difference: kelvin for degrees Celsius.
+
+    UDUNITS takes "g" for the gram, which it is in any unit but that of an acceleration.
+    """
+    if units in (INNER["acceleration"], ON_DISK[INNER["acceleration"]]):
+        return "standard_free_fall"
+    return units.replace("degree_Celsius", "K")
 
 
 def _multiply_units(units: str, more: dict[str, int]) -> str:
@@ -320,8 +326,8 @@ def slope_units(units: str, driver: str) -> str:
     --------
     >>> slope_units(INNER["rate"], INNER["temperature"]), slope_units("microradian", "K hour-1")
     ('degree hour-1 K-1', 'microradian K-1 hour')
-    >>> slope_units(INNER["rate"], "9.80665 m s-2")
-    'degree hour-1 standard_free_fall-1'
+    >>> slope_units(INNER["rate"], "9.80665 m s-2"), slope_units(INNER["rate"], "g cm-3")
+    ('degree hour-1 standard_free_fall-1', 'degree hour-1 g-1 cm3')
     """
     below = {name: -power for name, power in _unit_powers(_difference_unit(driver)).items()}
-    return _multiply_units(_difference_unit(units) if units in INNER.values() else units, below)
+    return _multiply_units(_difference_unit(units), below)

@@ -27,7 +27,6 @@ from gyrostab.kernels.regression.coupling import (
 )
 
 _MAX_BLOCKS = 160  # longer records are averaged further
-_MAX_SIMULATED_LAGS = 12  # in the simulation of the search; lags in between add no information
 _MAX_WINDOWS_PER_LENGTH = 8  # more add no information
 _MIN_BLOCKS = 12
 #: Level at which a coupling is significant.
@@ -64,16 +63,16 @@ def make_blocks(
     """Group windows into blocks at least as long as a window; None if there are too few."""
     windows = np.flatnonzero(mask)
     every = max(1, round(length / step / _MAX_WINDOWS_PER_LENGTH))
-    windows = (
-        windows[np.rint(time[windows] / step).astype(np.int64) % every == 0]
-        if every > 1
-        else windows
-    )
+    spans = np.rint(time[windows] / step).astype(np.int64) // every
+    windows = windows[np.unique(spans, return_index=True)[1]]  # the first known one of each span
     if windows.size < _MIN_BLOCKS:
         return None
     centres_s = time[windows]
-    block_length = max(length, step, (np.count_nonzero(mask) * step) / _MAX_BLOCKS)
-    numbers = np.unique((centres_s / block_length).astype(np.int64), return_inverse=True)[1]
+    block_length = max(length, step)
+    numbers = _number_blocks(centres_s, block_length)
+    while numbers[-1] + 1 > _MAX_BLOCKS:
+        block_length *= (numbers[-1] + 1) / _MAX_BLOCKS
+        numbers = _number_blocks(centres_s, block_length)
     if numbers[-1] + 1 < _MIN_BLOCKS:
         return None
     average = average_windows(numbers)
@@ -88,6 +87,11 @@ def make_blocks(
     trend = ((centre - centre.mean()) / (np.ptp(centre) or 1.0))[:, None]
     laws = noise_laws(average, centres_s, length, np.clip(share[windows], 0.05, 1.0))
     return Blocks(average, windows, pieces, offsets, trend, laws)
+
+
+def _number_blocks(centres_s: Floats, length: float) -> Ints:
+    """Number the blocks of this length that hold a window, and return the number by window."""
+    return np.unique((centres_s / length).astype(np.int64), return_inverse=True)[1]
 
 
 def fit_driver(
@@ -216,15 +220,9 @@ def _estimate_sensitivity(
     fit = fit_lags(laws, ((y - y.mean()) / scale)[:, None], driver)
     p_of_lags = p_values(fit)[0]
     best = int(np.argmin(p_of_lags))
-    simulated = np.unique(
-        np.append(
-            np.linspace(0, lags.size - 1, min(lags.size, _MAX_SIMULATED_LAGS)).astype(np.int64),
-            best,
-        )
-    )
     for draws in _NOISE_DRAWS:
-        p_of_noise = simulate_p_values(laws, driver[:, simulated], null_weights(fit, 0), draws)
-        p_at_lag = p_of_noise[:, np.searchsorted(simulated, best)]
+        p_of_noise = simulate_p_values(laws, driver, null_weights(fit, 0), draws)
+        p_at_lag = p_of_noise[:, best]
         p_value = calibrated(float(p_of_lags[best]), p_at_lag)
         p_search = max(p_value, calibrated(float(p_of_lags[best]), p_of_noise.min(axis=1)))
         if p_search > SIGNIFICANCE:

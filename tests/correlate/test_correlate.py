@@ -16,7 +16,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 import gyrostab
 from gyrostab.cli import main
 from gyrostab.correlate.dataset import join
-from gyrostab.correlate.fit import fit_driver
+from gyrostab.correlate.drivers import Driver
+from gyrostab.correlate.fit import fit_driver, make_blocks
 from gyrostab.correlate.judge import VERDICTS, format_correlation
 from gyrostab.errors import MissingUnitError, OptionError, TimeError, UnitError
 from gyrostab.kernels.regression.coupling import (
@@ -409,6 +410,44 @@ def test_adjusted_p_value_accounts_for_the_search_over_lags():
     )  # two drivers, Holm
 
 
+def test_search_over_lags_of_a_channel_without_memory_counts_every_lag():
+    """If driver and noise are white, 48 lags are 48 independent tests."""
+    rng = np.random.default_rng(7)
+    vibration, mean = rng.normal(size=207), rng.normal(size=(1, 160))
+    values = np.stack([vibration[47 - lag : 207 - lag] for lag in range(48)])
+    blocks = make_blocks(np.ones(160, bool), np.arange(160.0), 1.0, 1.0, np.ones(160))
+    (entry,) = fit_driver(
+        blocks, mean, Driver("vibration", "vibration", "g", values), [], np.arange(48.0), 0.95
+    )
+    expected = 1.0 - (1.0 - entry["p_value"]) ** 48
+    assert 0.2 < expected < 0.9
+    assert entry["p_search"] == pytest.approx(expected, rel=0.3)
+
+
+def test_a_thinned_product_keeps_its_windows():
+    def find_used(time):
+        return time[
+            make_blocks(np.ones(time.size, bool), time, 40.0, 1.0, np.ones(time.size)).windows
+        ]
+
+    every_second = np.arange(800.0)
+    np.testing.assert_array_equal(find_used(every_second), every_second[::5])  # 8 in a length
+    for k in (2, 7, 40):
+        thinned = every_second[::k]
+        np.testing.assert_array_equal(
+            find_used(thinned),
+            [thinned[thinned // 5 == span][0] for span in np.unique(thinned // 5)],
+        )
+
+
+@pytest.mark.parametrize("share", [1.0, 0.05])
+def test_scattered_windows_make_no_more_blocks_than_a_whole_record(share):
+    time = np.arange(4000) * 60.0
+    known = np.random.default_rng(0).random(4000) < share
+    blocks = make_blocks(known, time, 600.0, 60.0, np.ones(4000))
+    assert 100 < blocks.offsets.shape[0] <= 160
+
+
 def test_autocorrelation_lowers_the_effective_samples():
     many = gyrostab.correlate(coupled.product(noises="white", terms=False), max_lag=0)[
         "effective_samples"
@@ -502,6 +541,7 @@ def probe_channel(values, product, every):
         ("m s^-1", 1.0, 0.0, "m s-1"),
         ("m.s-1", 1.0, 0.0, "m s-1"),
         ("metre per second", 1.0, 0.0, "m s-1"),
+        ("g/cm3", 1.0, 0.0, "g cm-3"),  # the gram, not gravity
     ],
 )
 def test_sensitivities_are_in_the_unit_of_the_channel(units, factor, offset, inner):
@@ -518,6 +558,26 @@ def test_sensitivities_are_in_the_unit_of_the_channel(units, factor, offset, inn
         meant = cf_units.Unit("degree hour-1") / cf_units.Unit(over)
         assert cf_units.Unit(slope.units).convert(1.0, meant) == pytest.approx(1.0)
     np.testing.assert_allclose(found["probe"], expected["probe"])
+
+
+@pytest.mark.parametrize("units", ["degree hour-1", "rpm", "degF"])
+def test_a_channel_of_the_product_is_stored_in_the_unit_of_its_sensitivity(units):
+    product = coupled.product(slope=0.3, noises="white", gap=False, terms=False, axes="x")
+    product["other"] = (100 * product["temperature"] + 7).assign_attrs(units=units)
+    options = {"variables": "window_mean", "max_lag": 0}
+    expected = gyrostab.correlate(product, **options)
+    found = gyrostab.correlate(product, channel="other", **options)
+    drive = found["window_mean_per_other"] * np.ptp(found["other"].values)
+    np.testing.assert_allclose(
+        drive,
+        expected["window_mean_per_temperature"] * np.ptp(product["temperature"].values),
+        rtol=1e-6,
+    )
+    if units == "degree hour-1":
+        assert found["window_mean_per_other"].units == "1"
+        assert found["other"].identical(product["other"])
+    joined = join(product, found)
+    assert joined["other"].identical(found["other"])
 
 
 @pytest.mark.parametrize(
@@ -618,6 +678,11 @@ def test_errors_say_what_to_do():
         gyrostab.correlate(product, variables="avar")
     with pytest.raises(OptionError, match="variable 3"):
         gyrostab.correlate(product, variables=3)
+    with pytest.raises(OptionError, match="variables N, N are not all different; name each once"):
+        gyrostab.correlate(product, variables=["N", "N"])
+    named = product.rename(temperature="p_value")
+    with pytest.raises(OptionError, match=r"'p_value' has the name of a result .*rename\(p_value="):
+        gyrostab.correlate(named, channel="p_value")
     with pytest.raises(OptionError, match="at least one variable"):
         gyrostab.correlate(product, variables=[])
     for level in ("0.9", None, 95):
