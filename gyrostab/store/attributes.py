@@ -153,8 +153,10 @@ def decode_attributes(attrs: dict[str, Any]) -> dict[str, Any]:
         attrs[name] = value.item() if isinstance(value, np.generic) else value
     if "since" in str(attrs.get("units", "")):
         del attrs["units"]
-    for name in ("calendar", "units_metadata", "ancillary_variables"):
+    for name in ("calendar", "ancillary_variables"):
         attrs.pop(name, None)
+    if "leap_seconds" in str(attrs.get("units_metadata", "")):
+        del attrs["units_metadata"]
     if "source_units" in attrs:
         attrs["units"] = attrs.pop("source_units")
     inner = {stored: units for units, stored in ON_DISK.items()}

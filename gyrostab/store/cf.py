@@ -84,8 +84,7 @@ def to_disk(
     ]
     variables: dict[Any, xr.Variable] = {}
     for name, variable in dataset.variables.items():
-        if variable.dtype == np.float16:  # NetCDF has no such type
-            variable = variable.astype(np.float32)
+        variable = _convert_type(name, variable)
         known_attrs = {key: item for key, item in variable.attrs.items() if key not in _DECODING}
         if name in grids:
             encode = encode_all_stamps if stamps else encode_first_stamp
@@ -127,6 +126,22 @@ def to_disk(
         stored_set["avar"].attrs["ancillary_variables"] = " ".join(ancillary)
     stored_set.attrs = make_global_attributes(dataset, kind, verb)
     return stored_set
+
+
+def _convert_type(name: Any, variable: xr.Variable) -> xr.Variable:
+    """Convert numbers of a type that NetCDF has not; differences of times become seconds."""
+    dtype: Any = variable.dtype
+    if not isinstance(dtype, np.dtype) or dtype.kind not in "biufSUOTMm":
+        raise SchemaError(
+            f"{name!r} holds values of type {dtype}, which files cannot hold; convert it to "
+            "numbers, times or texts, for instance with .astype(str)"
+        )
+    if dtype.kind == "m":
+        seconds = variable.data / np.timedelta64(1, "s")  # NaN for NaT
+        return xr.Variable(variable.dims, seconds, {**variable.attrs, "units": "s"})
+    if dtype.kind == "f" and dtype.itemsize not in (4, 8):
+        return variable.astype(np.float32 if dtype.itemsize < 4 else np.float64)
+    return variable
 
 
 def _make_lazy(variable: xr.Variable) -> xr.Variable:

@@ -38,7 +38,7 @@ def time_attributes(divisor: int) -> dict[str, str]:
     return {
         "units": _UNITS[divisor],
         "calendar": "proleptic_gregorian",
-        "units_metadata": "leap_seconds: none",
+        "units_metadata": "leap_seconds: unknown",
     }
 
 

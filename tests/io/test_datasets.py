@@ -98,7 +98,7 @@ def test_layout_seen_by_plain_netcdf4(files):
                 isinstance(variable.getncattr(key), bool | type(None)) for key in variable.ncattrs()
             )
         assert file["time"].dtype == np.int64
-        assert file["time"].units_metadata == "leap_seconds: none"
+        assert file["time"].units_metadata == "leap_seconds: unknown"
         assert file["estimator"].flag_meanings == "none strict_runs weighted_clusters"
         assert list(file["axis"][:]) == ["x", "y", "z"]
         assert file["avar"][:].mask.any()
@@ -336,6 +336,47 @@ def test_missing_time_is_refused(tmp_path):
     with pytest.raises(SchemaError, match=r"gap_start.*1 missing"):
         to_netcdf(log, tmp_path / "log.nc")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("write", [to_netcdf, to_zarr])
+def test_differences_of_times_come_back_in_seconds(tmp_path, write):
+    log = synthetic.log()
+    elapsed = (log["time"] - log["time"][0]).values
+    log["elapsed"] = ("time", np.where(elapsed == elapsed[1], np.timedelta64("NaT"), elapsed))
+    log["elapsed"].attrs = {"long_name": "time since the start"}
+    expected = elapsed.astype(np.int64) / 1e9
+    expected[1] = np.nan
+    for made in (log, log.chunk(time=50)):
+        stored = open_dataset(write(made, tmp_path / "log", overwrite=True))["elapsed"]
+        np.testing.assert_allclose(stored, expected, rtol=1e-15)
+        assert stored.attrs == {"long_name": "time since the start", "units": "s"}
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.longdouble])
+def test_numbers_of_a_type_that_netcdf_has_not_are_converted(tmp_path, kind):
+    log = synthetic.log()
+    values = np.arange(log.sizes["time"]) % 1000 / 8
+    log["other"] = ("time", values.astype(kind), {"units": "1"})
+    stored = open_dataset(to_netcdf(log, tmp_path / "log.nc"))["other"]
+    np.testing.assert_array_equal(stored, values)
+
+
+@pytest.mark.parametrize(
+    "values", [np.full(3, 1j), pd.Categorical(list("aba")), pd.period_range("2026", periods=3)]
+)
+def test_values_that_files_cannot_hold_are_refused(tmp_path, values):
+    log = synthetic.log().assign(other=("other_row", values))
+    with pytest.raises(SchemaError, match=r"'other' holds values of type .*\.astype\(str\)"):
+        to_netcdf(log, tmp_path / "log.nc")
+    assert not list(tmp_path.iterdir())
+
+
+def test_metadata_of_units_come_back_where_they_are_not_of_times(tmp_path):
+    log = synthetic.log()
+    log["change"] = log["temperature"].assign_attrs(units_metadata="temperature: difference")
+    stored = open_dataset(to_netcdf(log, tmp_path / "log.nc", stamps=True))
+    assert stored["change"].attrs["units_metadata"] == "temperature: difference"
+    assert "units_metadata" not in stored["gap_start"].attrs
 
 
 def test_a_lazy_log_is_never_held_whole(tmp_path):
