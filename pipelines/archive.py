@@ -65,5 +65,5 @@ def main(plan_file):
 if __name__ == "__main__":
     try:
         main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).with_suffix(".toml"))
-    except GyrostabError as error:
+    except (GyrostabError, OSError) as error:
         sys.exit(f"{error}")

@@ -5,6 +5,7 @@ import tomllib
 from pathlib import Path
 
 import gyrostab
+from gyrostab.errors import GyrostabError
 
 
 def chain(plan, folder):
@@ -32,5 +33,8 @@ def sentences(correlation):
 
 if __name__ == "__main__":
     plan_file = Path(sys.argv[1] if len(sys.argv) > 1 else Path(__file__).with_suffix(".toml"))
-    result = chain(tomllib.loads(plan_file.read_text(encoding="utf-8")), plan_file.parent)
+    try:
+        result = chain(tomllib.loads(plan_file.read_text(encoding="utf-8")), plan_file.parent)
+    except (GyrostabError, OSError) as error:
+        sys.exit(f"{error}")
     print(*sentences(result), sep="\n")

@@ -385,7 +385,9 @@ def to_csv(product: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool
     names += [str(name) for name, part in product.data_vars.items() if part.dims == ("time",)]
     table = pd.DataFrame(
         {
-            "time": np.repeat(product["time"].values, product.sizes["axis"]),
+            "time": np.repeat(
+                pd.DatetimeIndex(product["time"].values).round("us"), product.sizes["axis"]
+            ),
             "axis": np.tile(product["axis"].values, product.sizes["time"]),
         }
     )

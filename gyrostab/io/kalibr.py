@@ -153,7 +153,7 @@ def to_kalibr(
     ------
     SchemaError
         When `product` is not a product, or has no sampling rate, or `log` has no accelerometer or
-        does not cover the product.
+        does not cover the product, or `product` has no attribute ``window_s`` or ``step_s`` for it.
     OutputError
         When the file exists, or cannot be written.
     """
@@ -164,6 +164,12 @@ def to_kalibr(
             "the product has no attribute 'sampling_rate_hz', which is Kalibr's update_rate; "
             "give it one in Hz"
         )
+    for name in ("window_s", "step_s") if log is not None else ():
+        if name not in product.attrs:
+            raise SchemaError(
+                f"the product has no attribute {name!r}, by which windows of the accelerometers "
+                f"are made; set it in seconds with .assign_attrs({name}=...)"
+            )
     names = [Path(name).name for name in texts(product, "source_files")]
     fitted = {"gyroscope": (product, KEYS)}
     if log is not None:

@@ -149,7 +149,8 @@ def survey_terms(
         "station": duration_seconds(station_time, "station_time (--station-time)"),
         "section": duration_seconds(section_time, "section_time (--section-time)"),
         "calibration": duration_seconds(
-            calibration_time or station_time, "calibration_time (--calibration-time)"
+            station_time if calibration_time is None else calibration_time,
+            "calibration_time (--calibration-time)",
         ),
     }
     content = getattr(diagnosis, "content", diagnosis)

@@ -346,10 +346,10 @@ def _check_tau(surface: xr.Dataset) -> None:
         )
     factors = np.asarray(surface.variables["tau"].values, dtype=np.float64) * float(rate)
     whole_factors = np.rint(factors)
-    if (
-        np.any(whole_factors < 1)
-        or np.any(np.abs(factors - whole_factors) > _TAU_TOLERANCE * whole_factors)
-        or np.any(np.diff(whole_factors) <= 0)
+    if not (  # NaN compares false
+        np.all(whole_factors >= 1)
+        and np.all(np.abs(factors - whole_factors) <= _TAU_TOLERANCE * whole_factors)
+        and np.all(np.diff(whole_factors) > 0)
     ):
         raise SchemaError(
             "the averaging times of the surface are not rising whole numbers of samples at "

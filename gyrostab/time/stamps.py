@@ -118,7 +118,11 @@ def split_instant(text: str) -> tuple[int, int, int, int] | None:
     if zone and zone[0] in "+-":
         digits = zone[1:].replace(":", "")
         hours, minutes = (digits, "0") if len(digits) <= 2 else (digits[:-2], digits[-2:])
+        if int(hours) > 23 or int(minutes) > 59:
+            return None
         seconds -= int(f"{zone[0]}1") * (3600 * int(hours) + 60 * int(minutes))
+    if second == 60 and seconds % 86400:  # a leap second is the last one of a day
+        return None
     return year, month, day, seconds * NANOSECONDS + int((fraction or "0")[:9].ljust(9, "0"))
 
 

@@ -240,6 +240,12 @@ class TestAccelerometers:
         with pytest.raises(SchemaError, match="does not cover"):
             to_kalibr(product, tmp_path / "imu.yaml", log=log.isel(time=slice(2_000)))
 
+    @pytest.mark.parametrize("name", ["window_s", "step_s"])
+    def test_attributes_that_are_missing_are_named(self, product, tmp_path, name):
+        del product.attrs[name]
+        with pytest.raises(SchemaError, match=rf"no attribute '{name}'.*\({name}=\.\.\.\)"):
+            to_kalibr(product, tmp_path / "imu.yaml", log=synthetic.log())
+
     def test_slow_or_missing_channels_are_named(self, tmp_path):
         log = make_accelerometers(samples=2_000)
         product = gyrostab.fit_noise(gyrostab.davar(log, window="10s"))

@@ -177,7 +177,12 @@ def test_wrong_products_are_refused(change, error, message):
 
 @pytest.mark.parametrize(
     "options",
-    [{"statistic": "mean"}, {"station_time": "120"}, {"section_time": "-1h"}],
+    [
+        {"statistic": "mean"},
+        {"station_time": "120"},
+        {"section_time": "-1h"},
+        {"calibration_time": 0},
+    ],
 )
 def test_wrong_options_are_refused(options):
     with pytest.raises(OptionError):

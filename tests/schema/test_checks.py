@@ -46,6 +46,10 @@ def product() -> xr.Dataset:
             lambda p: p.assign_attrs(sampling_rate_hz="20 Hz"),
             "sampling_rate_hz .* is '20 Hz', not a number",
         ),
+        (
+            lambda p: p.assign_coords(tau=np.where(p.tau == p.tau[1], np.nan, p.tau)),
+            "averaging times of the surface are not rising whole numbers of samples",
+        ),
     ],
 )
 def test_what_is_not_a_product_is_refused_with_advice(
