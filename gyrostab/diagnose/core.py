@@ -274,7 +274,8 @@ def _leave_out_motion(task: Task, named: NamedBlocks) -> NamedBlocks | None:
         return None
     blocks, identifications = named.blocks, named.identifications
     state = replace(
-        identifications.start_state(named.baseline), weight=identifications.state.weight
+        identifications.start_state(named.baseline),
+        expected_power=identifications.state.expected_power,
     )
     moving = unexplained_motion(blocks, identifications.identified, state)
     if not moving.any():

@@ -269,7 +269,7 @@ def _find_free_bands(state: State, axis: str) -> Bools:
     """Find the bands (band,) that have power of any size in the model, such as those of lines."""
     out = np.zeros(state.blocks.sizes["band"], np.bool_)
     for column in state.power_columns(axis):
-        shown = np.broadcast_to(column != 0.0, state.weight.shape[1:]).any(axis=0)
+        shown = np.broadcast_to(column != 0.0, state.expected_power.shape[1:]).any(axis=0)
         out |= shown & (shown.sum() == 1)
     return out
 
@@ -300,7 +300,7 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
         power,
         shape,
         np.nan_to_num(cells),
-        state.weight[row].mean(axis=1),
+        state.expected_power[row].mean(axis=1),
         chosen,
         _LEVEL_GROUPS if varies else 1,
     )

@@ -76,12 +76,12 @@ def predict_baseline(
         for place, columns in state.given.items():
             known_of = is_left_out.setdefault(place, [])
             known_of += [identification in left_out] * (len(columns) - len(known_of))
-    weight = state.weight.copy()
+    spectrum = state.expected_power.copy()
     for row, axis in enumerate(state.axes):
         places = (("power", axis), ("added_power", axis))  # as in `State.power_columns`
         dropped = np.array([flag for at in places for flag in is_left_out.get(at, [])], np.bool_)
         if dropped.any():
-            weight[row] = fit_powers(state, axis, dropped)
+            spectrum[row] = fit_powers(state, axis, dropped)
     state = replace(state, blocks=usable_blocks, masked=identifications.state.masked)
     empty_state = replace(state, given={})
     mean = baseline["known_mean"].values.copy()
@@ -92,7 +92,7 @@ def predict_baseline(
             size, _ = mean_mixture(empty_state, axis, columns).moments()
             mean[row] += np.tensordot(size[is_kept], np.stack(columns)[is_kept], axes=1)
     predicted = state.baseline.assign(
-        spectrum=baseline["spectrum"].copy(data=weight),
+        spectrum=baseline["spectrum"].copy(data=spectrum),
         known_mean=baseline["known_mean"].copy(data=mean),
     )
     remaining = [identification for identification in identified if identification not in left_out]
@@ -115,7 +115,7 @@ def predict_baseline(
 
 def _cross_spectra(components: Sequence[Component], state: State) -> Complexes:
     """Return the cross-spectra of noise that axes have in common, in a state without effects."""
-    shape = state.weight.shape[1:]
+    shape = state.expected_power.shape[1:]
     pairs = pair_rows(state.blocks)
     total = np.zeros((len(pairs), *shape), np.complex128)
     for component in components:

@@ -155,7 +155,7 @@ def _average_powers(axis: str, state: State) -> tuple[Fit, Floats]:
     blocks, row = state.blocks, state.axes.index(axis)
     power, shape = blocks["power"].values[row], reduced_shape(blocks)[row]
     effects_of_axis = state.power_columns(axis)
-    columns = [unspread_share(blocks)[row, :, None], state.weight[row], *effects_of_axis]
+    columns = [unspread_share(blocks)[row, :, None], state.expected_power[row], *effects_of_axis]
     averaged = average_blocks(
         power,
         np.where(state.masked[row][:, None], np.nan, shape),

@@ -208,7 +208,7 @@ def _collect_effects(
         for component in components:
             if not component.is_filter:
                 known, free, means = component.statistic.noise_shares(
-                    component, axis, start, identifications.state.weight
+                    component, axis, start, identifications.state.expected_power
                 )
                 out.known += known
                 out.free += [np.broadcast_to(column, shape) for column in free]
@@ -282,7 +282,7 @@ def _fit_noise(
     if chosen.sum() < MIN_BLOCKS:
         return None
     columns = noise_powers(blocks, axis_effects.response)[row]
-    fit = _average_powers(power, shape, columns, state.weight[row], axis_effects, chosen)
+    fit = _average_powers(power, shape, columns, state.expected_power[row], axis_effects, chosen)
     square, information, _ = fit_squares(fit)
     assert fit.start is not None
     plain = float((fit.weight / np.square(fit.start) * fit.columns[:, 1] ** 2).sum())
@@ -291,7 +291,7 @@ def _fit_noise(
     square = with_floor(square, fit)
     variance = white_variance(blocks, square[None])[row]
     unfiltered = noise_powers(blocks)[row, :, 0] @ square
-    variance = variance * np.maximum(state.weight[row, :, 0] / unfiltered, 0.1)
+    variance = variance * np.maximum(state.expected_power[row, :, 0] / unfiltered, 0.1)
     effect_means = np.stack(axis_effects.means, axis=1) if axis_effects.means else None
     return noise_posterior(fit, blocks, row, variance, chosen, effect_means, state.settings, wander)
 

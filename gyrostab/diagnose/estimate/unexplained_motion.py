@@ -89,7 +89,7 @@ def _explains_power(
     measured = axis_values(state.blocks, "power", axis)
     predicted = np.zeros_like(measured)
     for component in followers:
-        power, *_ = component.statistic.noise_shares(component, axis, state, state.weight)
+        power, *_ = component.statistic.noise_shares(component, axis, state, state.expected_power)
         predicted += power
     good = np.isfinite(measured) & moving[:, None]
     width = np.broadcast_to(band_widths(state.blocks), measured.shape)[good]

@@ -110,7 +110,7 @@ class Identifications:
         chosen: list[Selection] = [*self.expected, *self.identified, *self.unknown]
         return replace(
             condition_on_selections(self.start_state(baseline), chosen, identification),
-            weight=self.state.weight,
+            expected_power=self.state.expected_power,
             masked=self.state.masked,
         )
 

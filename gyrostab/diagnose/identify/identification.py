@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from gyrostab.diagnose.identify.components import are_lines, axes_of, sum_evidence
 from gyrostab.diagnose.predict.candidates import Component
-from gyrostab.diagnose.predict.condition import condition_on_components, refit_weights
+from gyrostab.diagnose.predict.condition import condition_on_components, refit_powers
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
@@ -67,7 +67,7 @@ def conditioned_states(start: State, chosen: Sequence[Selection]) -> Iterator[St
     for number, selection in enumerate(chosen):
         state = condition_on_components(state, selection.components)
         if not all(of_lines[number : number + 2]) or number + 1 == len(chosen):
-            state = refit_weights(state)
+            state = refit_powers(state)
         yield state
 
 

@@ -156,7 +156,7 @@ def score_candidates(
             break
         trial = condition_on(state, find_components(strongest, settings=settings))
         weighted_evidence = examination.compute_evidence(
-            weighted, replace(state, weight=trial.weight)
+            weighted, replace(state, expected_power=trial.expected_power)
         )
         all_evidence = [
             evidence

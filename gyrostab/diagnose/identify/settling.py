@@ -139,7 +139,9 @@ def find_instead(
     They are in its statistics and on its axes. `state` has all others in the model; it is returned
     with the weights that it has with the selection.
     """
-    weighted = replace(state, weight=condition_on(state, list(selection.components)).weight)
+    weighted = replace(
+        state, expected_power=condition_on(state, list(selection.components)).expected_power
+    )
     statistics = {component.statistic for component in selection.components}
     candidates = [
         candidate for candidate in examination.candidates if candidate.statistic in statistics
@@ -172,10 +174,10 @@ def _find_layers_again(
     jumps explains little alone. `first` was found with none of the identification in the model.
     """
     out = [list(first)]
-    weight, key = state.weight, components[0].candidate.key
+    expected_power, key = state.expected_power, components[0].candidate.key
     axes = {axis for component in components for axis in component.row}
     for previous_layer, layer in pairwise(split_layers(components)):
-        state = replace(condition_on(state, previous_layer), weight=weight)
+        state = replace(condition_on(state, previous_layer), expected_power=expected_power)
         layer_components = examination.find_components(candidates_of(layer), state).get(key, [])
         out.append([component for component in layer_components if set(component.row) & axes])
     return out

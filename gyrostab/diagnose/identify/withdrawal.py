@@ -207,14 +207,14 @@ def _power_levels(state: State, row: int, axis: str) -> tuple[Floats, Floats, Fl
     The level is relative to the expected one, less 1.
     """
     shape = axis_values(state.baseline, "shape_alone", axis)
-    ratio = state.blocks["power"].values[row] / state.weight[row] - 1.0
+    ratio = state.blocks["power"].values[row] / state.expected_power[row] - 1.0
     use = np.where(np.isfinite(shape) & np.isfinite(ratio), shape, 0.0)
     total = use.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         level = (use * np.nan_to_num(ratio)).sum(axis=1) / total
         variance = 1.0 / total + axis_values(state.baseline, "common", axis)
         named = [
-            (use * column / state.weight[row]).sum(axis=1) / total
+            (use * column / state.expected_power[row]).sum(axis=1) / total
             for column in state.power_columns(axis)
         ]
     columns = np.nan_to_num(np.stack(named, axis=-1)) if named else np.empty((total.size, 0))

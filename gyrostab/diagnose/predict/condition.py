@@ -1,4 +1,4 @@
-"""Conditioning on named effects: given columns in every statistic, masked blocks, new weights."""
+"""Conditioning on named effects: given columns in every statistic, masked blocks, new powers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MIN_POWER_RATIO = 0.2
 
 def condition_on(state: State, components: list[Component]) -> State:
     """Add an effect to the state and refit the powers."""
-    return refit_weights(condition_on_components(state, components))
+    return refit_powers(condition_on_components(state, components))
 
 
 def condition_on_components(state: State, components: Iterable[Component]) -> State:
@@ -60,26 +60,26 @@ def find_bands(blocks: xr.Dataset, frequency: float) -> Ints:
 
 def free_shape(state: State, axis: str) -> State:
     """Add any spectrum of constant shape to the powers of an axis."""
-    bands = state.weight.shape[2]
+    shape = state.expected_power.shape[1:]
     return state.with_columns(
-        "power", axis, [np.broadcast_to(band, state.weight.shape[1:]) for band in np.eye(bands)]
+        "power", axis, [np.broadcast_to(band, shape) for band in np.eye(shape[1])]
     )
 
 
-def refit_weights(state: State) -> State:
-    """Set the weights by a fit of all given power columns (Fisher scoring, gamma likelihood)."""
-    weight = state.weight.copy()
+def refit_powers(state: State) -> State:
+    """Set the expected powers by a fit of all given power columns (Fisher scoring, gamma law)."""
+    power = state.expected_power.copy()
     for row, axis in enumerate(state.axes):
         if state.power_columns(axis):
-            weight[row] = fit_powers(state, axis)
+            power[row] = fit_powers(state, axis)
     return replace(
-        state, weight=weight, blocks=drop_changed_tails(state.blocks, weight, state.settings)
+        state, expected_power=power, blocks=drop_changed_tails(state.blocks, power, state.settings)
     )
 
 
 def fit_powers(state: State, axis: str, left_out: Bools | None = None) -> Floats:
     """Fit the powers of an axis, (block, band), and leave some of its power columns out of them."""
-    row, shape = state.axes.index(axis), state.weight.shape[1:]
+    row, shape = state.axes.index(axis), state.expected_power.shape[1:]
     expected = axis_values(state.baseline, "spectrum", axis)
     level, precision, low = noise_columns(state.baseline, axis=axis)
     level_count = level.shape[2]

@@ -31,9 +31,9 @@ class State:
 
     blocks: xr.Dataset
     baseline: xr.Dataset
-    #: (axis, block, band): powers that define the weights of all cells [degree2 hour-2 Hz-1]:
-    #: expected, plus those of the named effects.
-    weight: Array
+    #: (axis, block, band): expected powers with the named effects [degree2 hour-2 Hz-1]. They give
+    #: the variance, and so the weight, of every cell.
+    expected_power: Array
     masked: Bools  # (axis, block): blocks whose powers and cross-spectra are left out
     #: (statistic, row) -> columns in the model with and without a candidate; the row is an axis, or
     #: the two axes of a pair with a comma between them. Powers that effects add, whose sizes cannot
@@ -86,8 +86,8 @@ def initial_state(
     blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
 ) -> State:
     """Return the state in which no effect is named."""
-    weight = baseline["spectrum"].values
-    return State(blocks, baseline, weight, np.zeros(weight.shape[:2], np.bool_), settings=settings)
+    power = baseline["spectrum"].values
+    return State(blocks, baseline, power, np.zeros(power.shape[:2], np.bool_), settings=settings)
 
 
 def simulate_noise(model: LinearModel, rng: np.random.Generator, count: int) -> LinearModel:
@@ -239,7 +239,7 @@ def power_column(density: Array, row: int, state: State) -> Array:
     mixed = mix_with_mean(
         select_row(density, row), unspread_share(state.blocks)[row], band_widths(state.blocks)
     )
-    return np.broadcast_to(mixed, state.weight.shape[1:])
+    return np.broadcast_to(mixed, state.expected_power.shape[1:])
 
 
 def cross_column(density: Array, row: int, blocks: xr.Dataset) -> Array:

@@ -234,12 +234,12 @@ class Statistic:
         return state
 
     def noise_shares(
-        self, component: Component, axis: str, state: State, weight: Array
+        self, component: Component, axis: str, state: State, expected_power: Array
     ) -> tuple[Array | float, list[Array], list[Array]]:
         """Return what a component takes from the noise of an axis.
 
         These are a power of known size (block, band), and powers and means of free size. The state
-        is that without any effect, `weight` (axis, block, band) the powers with all effects.
+        is that without any effect, `expected_power` (axis, block, band) that with all effects.
         """
         if not self.takes_noise:
             return 0.0, [], []

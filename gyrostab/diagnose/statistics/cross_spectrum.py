@@ -143,7 +143,8 @@ class CrossSpectrum(Statistic):
         values = records_last(data["cross"].values, 3)[row] - shared[..., None]
         shape = state.blocks["cross_shape"].values[row]
         # The scatter is larger in phase with shared noise, and smaller in quadrature.
-        noise_product, shared_product = state.weight[i] * state.weight[j], (shared**2).real
+        noise_product = state.expected_power[i] * state.expected_power[j]
+        shared_product = (shared**2).real
         in_quadrature = np.maximum(
             noise_product - shared_product, _MIN_QUADRATURE_SHARE * noise_product
         )

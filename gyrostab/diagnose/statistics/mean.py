@@ -356,5 +356,5 @@ def _moving_blocks(state: State, row: int, columns: list[Floats]) -> Bools:
     size, *_ = np.linalg.lstsq(design[good], y[good], rcond=None)
     curve = design @ size
     mask = np.zeros_like(state.masked)
-    mask[row] = moves_within_blocks(curve, state.weight[row, :, 0], blocks, state.settings)
+    mask[row] = moves_within_blocks(curve, state.expected_power[row, :, 0], blocks, state.settings)
     return mask

@@ -142,7 +142,7 @@ class Power(Statistic):
         axis = state.axes[row]
         expected = axis_values(state.baseline, "spectrum", axis)
         values = records_last(data["power"].values, 3)[row] - expected[..., None]
-        weight = axis_values(state.baseline, "shape_alone", axis) / state.weight[row] ** 2
+        weight = axis_values(state.baseline, "shape_alone", axis) / state.expected_power[row] ** 2
         weight = np.where(state.masked[row][:, None], 0.0, weight)
         level, precision, low = noise_columns(state.baseline, axis=axis)
         unspread, width = unspread_share(state.blocks)[row], band_widths(state.blocks)
@@ -161,7 +161,7 @@ class Power(Statistic):
             low=[*low, *state.least_powers(axis)],
         )
         common = axis_values(state.baseline, "common", axis)
-        return with_independent_cells(model, common, state.weight[row])
+        return with_independent_cells(model, common, state.expected_power[row])
 
     def is_filter(self, variant: Variant) -> bool:
         """Return whether a variant has no size: what a filter does at its full size."""
@@ -233,7 +233,7 @@ def parts_of_record(component: Component, state: State) -> Iterator[Competitor]:
     """
     if not effects()[component.candidate.effect].is_steady:
         return
-    state = replace(state, weight=condition_on(state, [component]).weight)
+    state = replace(state, expected_power=condition_on(state, [component]).expected_power)
     size, error = np.array(
         [
             _fit_part(component, state, inside)

@@ -121,7 +121,7 @@ class RampPhase(Statistic):
         values = records_last(data["profile"].values, 3)[row]
         rate = float(state.blocks.attrs["sampling_rate_hz"])
         width = (state.blocks["band_high"] - state.blocks["band_low"]).values
-        variance = rate * (state.weight[row] * width).sum(axis=-1) / width.sum()
+        variance = rate * (state.expected_power[row] * width).sum(axis=-1) / width.sum()
         weight = state.blocks["profile_samples"].values[row] / variance[:, None]
         given = [np.ones(weight.shape[1]), *state.given.get(("phase_locked", state.axes[row]), [])]
         return linear_model(values, weight, variant_designs(candidates), given)
@@ -133,11 +133,12 @@ class RampPhase(Statistic):
         return free_shape(state, component.row[0])
 
     def noise_shares(
-        self, component: Component, axis: str, state: State, weight: Floats
+        self, component: Component, axis: str, state: State, expected_power: Floats
     ) -> tuple[Floats | float, list[Floats], list[Floats]]:
         """Return the power of the aliased lines of the profile."""
         blocks = state.blocks
-        mean, _ = component_mixture(component, replace(state, weight=weight)).moments()
+        state = replace(state, expected_power=expected_power)
+        mean, _ = component_mixture(component, state).moments()
         profile = np.tensordot(mean, component.variant.design, axes=1)
         square = np.abs(np.fft.rfft(profile)[1:] / profile.size) ** 2
         turns, rate = np.abs(blocks["ramp_turns"].values), float(blocks.attrs["sampling_rate_hz"])

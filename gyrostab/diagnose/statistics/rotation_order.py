@@ -204,7 +204,9 @@ def order_weight(state: State) -> Array:
     )
     nearest = np.abs(np.log(np.maximum(place, frequency[0])[..., None] / frequency)).argmin(axis=-1)
     level = np.take_along_axis(
-        state.weight, np.broadcast_to(nearest, (state.weight.shape[0], *nearest.shape)), axis=2
+        state.expected_power,
+        np.broadcast_to(nearest, (state.expected_power.shape[0], *nearest.shape)),
+        axis=2,
     )
     level = noise_at_orders(blocks, level)
     seconds = blocks["order_samples"].values / rate
@@ -252,7 +254,7 @@ def _visible_bands(density: Array, axis: str, state: State) -> Bools:
     """Find the bands in which an added density (block, band) is visible in the record."""
     row = state.axes.index(axis)
     shape = np.nan_to_num(state.blocks["shape"].values[row])
-    ratio = density / state.weight[row]
+    ratio = density / state.expected_power[row]
     return np.asarray((shape * ratio**2).sum(axis=0) >= state.settings.visible_sigma**2)
 
 
@@ -260,7 +262,7 @@ def _visible_lines(line_power: Array, axis: str, state: State) -> Bools:
     """Find the lines at which an added density (line,) is visible in the record."""
     row, blocks = state.axes.index(axis), state.blocks
     bands, lines = blocks["frequency"].values, blocks["line_frequency"].values
-    noise = interpolate_bands(state.weight[row].mean(axis=0)[None], lines, bands)[0]
+    noise = interpolate_bands(state.expected_power[row].mean(axis=0)[None], lines, bands)[0]
     count = blocks["line_weight"].values[row].sum()
     return np.asarray(line_power / noise * math.sqrt(count) >= state.settings.visible_sigma)
 

@@ -147,7 +147,7 @@ def _max_factor(axis: str, variant: Variant, state: State) -> float:
     power, shape = (axis_values(blocks, name, axis) for name in ("power", "shape"))
     weight = (
         np.where(np.isfinite(power) & np.isfinite(shape), shape, 0.0)
-        / state.weight[state.axes.index(axis)] ** 2
+        / state.expected_power[state.axes.index(axis)] ** 2
     )
     return math.sqrt(
         float((weight * design * np.nan_to_num(power)).sum() / (weight * design**2).sum())

@@ -142,7 +142,7 @@ class SpectralLine(Statistic):
         axis = component.row[0]
         power_columns = state.power_columns(axis)
         for band in find_bands(state.blocks, frequency):
-            column = np.zeros(state.weight.shape[1:])
+            column = np.zeros(state.expected_power.shape[1:])
             column[:, band] = 1.0
             if any(np.array_equal(column, other) for other in power_columns):
                 continue  # another line in the same band is already given
@@ -152,7 +152,7 @@ class SpectralLine(Statistic):
         return state.with_columns("line", "all", [skirt])
 
     def noise_shares(
-        self, component: Component, axis: str, state: State, weight: Floats
+        self, component: Component, axis: str, state: State, expected_power: Floats
     ) -> tuple[Floats | float, list[Floats], list[Floats]]:
         """Return the power of the line and its skirt above the spectrum around them.
 
@@ -160,7 +160,7 @@ class SpectralLine(Statistic):
         """
         blocks, place = state.blocks, component.place
         if place < 0 or math.isfinite(line_quality(blocks, state.baseline, axis, place)):
-            return super().noise_shares(component, axis, state, weight)
+            return super().noise_shares(component, axis, state, expected_power)
         total, _ = mean_line_power(blocks, axis)
         skirt = line_skirt(blocks, axis, place, state.settings)
         above = np.where(skirt, total - local_level(total), 0.0)

@@ -91,7 +91,7 @@ class Transfer(Statistic):
         )
         root = np.sqrt(np.where(power > 0.0, power, np.nan))
         share = _moving_share(candidates[0].reference[0], power, state)
-        weight = 2.0 * state.blocks["shape"].values[row] / state.weight[row]
+        weight = 2.0 * state.blocks["shape"].values[row] / state.expected_power[row]
         weight = np.where(
             np.isfinite(root) & np.isfinite(weight) & ~state.masked[row][:, None], weight, 0.0
         )
@@ -120,10 +120,11 @@ class Transfer(Statistic):
         return state
 
     def noise_shares(
-        self, component: Component, axis: str, state: State, weight: Array
+        self, component: Component, axis: str, state: State, expected_power: Array
     ) -> tuple[Array | float, list[Array], list[Array]]:
         """Return the power that follows the channel or the other axis."""
-        mean, _ = component_mixture(component, replace(state, weight=weight)).moments()
+        state = replace(state, expected_power=expected_power)
+        mean, _ = component_mixture(component, state).moments()
         transfer = np.tensordot(mean, component.variant.design, axes=1)
         power = reference_channel_power(component.candidate.reference[0], state.blocks)
         return np.abs(transfer) ** 2 * np.nan_to_num(power), [], []

@@ -162,7 +162,7 @@ def test_evidence_is_recalled_only_where_nothing_has_changed() -> None:
         "another line in its band": condition_on(with_line, [replace(line, place=line.place + 1)]),
         "jump": with_jump,
         "lost block": replace(start, blocks=lost),
-        "other weights": replace(start, weight=1.1 * start.weight),
+        "other weights": replace(start, expected_power=1.1 * start.expected_power),
         "masked": replace(start, masked=start.masked | (np.arange(start.masked.shape[1]) < 2)),
         "random walk": replace(
             start, baseline=with_process(start.baseline, "x", np.full(start.masked.shape[1], 1e-3))

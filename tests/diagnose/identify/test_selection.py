@@ -256,12 +256,12 @@ def test_time_shifted_channels_explain_less(shaken):
 
 def test_identified_effect_is_in_the_model_of_the_next(shaken):
     (identification,) = shaken.identified
-    loud = shaken.state.weight[0] / shaken.state.baseline["spectrum"].values[0]
+    loud = shaken.state.expected_power[0] / shaken.state.baseline["spectrum"].values[0]
     vibration = shaken.state.blocks["channel_vibration"].values
     assert loud[vibration > 4].mean() > 1.2
     assert loud[vibration < 1].mean() == pytest.approx(1.0, abs=0.05)
     conditioned = condition_on(shaken.state, list(identification.components))
-    np.testing.assert_allclose(conditioned.weight, shaken.state.weight, rtol=1e-3)
+    np.testing.assert_allclose(conditioned.expected_power, shaken.state.expected_power, rtol=1e-3)
 
 
 def test_identifications_are_frozen_data(shaken):

@@ -17,7 +17,7 @@ from gyrostab.diagnose.identify.identification import Selection
 from gyrostab.diagnose.identify.selection import _select_all
 from gyrostab.diagnose.identify.withdrawal import variance_fluctuation
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
-from gyrostab.diagnose.predict.condition import refit_weights
+from gyrostab.diagnose.predict.condition import refit_powers
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
@@ -40,10 +40,11 @@ def fluctuation_left(blocks: xr.Dataset, *columns: np.ndarray) -> float:
     """Return the variance fluctuation with columns (block,) of added white power in the model."""
     state: State = initial_state(blocks, calibrate_noise(blocks))
     spread = [
-        np.broadcast_to(column[:, None], state.weight.shape[1:]).astype(float) for column in columns
+        np.broadcast_to(column[:, None], state.expected_power.shape[1:]).astype(float)
+        for column in columns
     ]
     return variance_fluctuation(
-        refit_weights(state.with_columns("power", "x", spread)) if columns else state, "x"
+        refit_powers(state.with_columns("power", "x", spread)) if columns else state, "x"
     )
 
 
@@ -52,7 +53,7 @@ def test_noise_that_fluctuates_on_one_axis_stays_named_on_the_others(monkeypatch
         make_log(np.random.default_rng(2).standard_normal((3, 6000)), rate=10.0, unit="deg/h")
     )
     start = initial_state(blocks, calibrate_noise(blocks))
-    white = Variant({}, ("white",), np.ones((1, 1, *start.weight.shape[1:])), squared=True)
+    white = Variant({}, ("white",), np.ones((1, 1, *start.expected_power.shape[1:])), squared=True)
     candidate = Candidate("vibration_noise", find_statistic("power"), ("vibration",), (white,))
     components = tuple(
         Component(candidate, white, (axis,), nats)

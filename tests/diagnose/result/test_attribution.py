@@ -299,14 +299,14 @@ def test_leaving_out_power_that_was_fitted_below_zero_adds_none(shaken):
     """The least power bounds what remains, and not the sum from which the share is taken."""
     blocks, baseline, _, _ = shaken
     state = initial_state(blocks, baseline)
-    level, part = state.weight[0], np.zeros((blocks.sizes["block"], 1))
+    level, part = state.expected_power[0], np.zeros((blocks.sizes["block"], 1))
     part[:18], part[18:20] = 1.0, 100.0
     power = blocks["power"].copy()
     power[0, :18], power[0, 18:20] = 0.5 * level[:18], np.nan  # the share is negative
     state = replace(state, blocks=state.blocks.assign(power=power))
     state = state.with_columns("power", "x", [level * part])
     whole, without = fit_powers(state, "x"), fit_powers(state, "x", np.array([True]))
-    np.testing.assert_allclose(whole[18:20], MIN_POWER_RATIO * state.weight[0, 18:20])
+    np.testing.assert_allclose(whole[18:20], MIN_POWER_RATIO * state.expected_power[0, 18:20])
     np.testing.assert_allclose(without[:20] / without[20:40], 1.0, atol=0.2)
 
 
