@@ -22,9 +22,9 @@ from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.recalibrate import remove_fast_switching
 from gyrostab.diagnose.estimate.unexplained_motion import unexplained_motion
 from gyrostab.diagnose.identify.examination import prepare_examination
-from gyrostab.diagnose.identify.identification import components_of
+from gyrostab.diagnose.identify.forward_search import identify_effects
 from gyrostab.diagnose.identify.late_channels import find_late_channel
-from gyrostab.diagnose.identify.selection import identify_effects
+from gyrostab.diagnose.identify.selections import components_of
 from gyrostab.diagnose.locate.mismatches import Region, locate_mismatches
 from gyrostab.diagnose.nulls.records import repeatable_null_records
 from gyrostab.diagnose.nulls.scores import NullScores, null_scores
@@ -274,7 +274,7 @@ def _leave_out_motion(task: Task, named: NamedBlocks) -> NamedBlocks | None:
         return None
     blocks, identifications = named.blocks, named.identifications
     state = replace(
-        identifications.start_state(named.baseline),
+        identifications.state_without_effects(named.baseline),
         expected_power=identifications.state.expected_power,
     )
     moving = unexplained_motion(blocks, identifications.identified, state)

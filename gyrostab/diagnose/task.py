@@ -16,7 +16,7 @@ import xarray as xr
 from gyrostab.arrays import Bools
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
-from gyrostab.diagnose.identify.examination import Identifications
+from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.moving_blocks import without_motion
 from gyrostab.diagnose.settings import Settings

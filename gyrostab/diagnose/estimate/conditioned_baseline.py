@@ -11,8 +11,8 @@ import xarray as xr
 from gyrostab.arrays import Bools, Complexes
 from gyrostab.diagnose.baseline.known_effects import EVERYWHERE
 from gyrostab.diagnose.estimate.joint_fit import Fitted
-from gyrostab.diagnose.identify.examination import Identifications
-from gyrostab.diagnose.identify.identification import (
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import (
     Selection,
     components_of,
     condition_on_selections,
@@ -131,7 +131,7 @@ def expected_baseline(
 ) -> xr.Dataset:
     """Return the baseline with the expected effects only, fitted to the `known` blocks."""
     return (
-        predict_baseline(replace(identifications, identified=(), unknown=()), baseline, known)
+        predict_baseline(replace(identifications, identified=(), unidentified=()), baseline, known)
         if identifications.expected
         else baseline
     )

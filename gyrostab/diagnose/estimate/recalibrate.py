@@ -32,8 +32,8 @@ from gyrostab.diagnose.baseline.posterior import (
 )
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.evidence.wandering import RandomProcesses, expected_processes
-from gyrostab.diagnose.identify.examination import Identifications
-from gyrostab.diagnose.identify.identification import components_of, condition_on_selections
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import components_of, condition_on_selections
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, spread_by_gaps
@@ -78,7 +78,7 @@ def recalibrate(
     blocks = identifications.state.blocks
     use = np.ones(blocks.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
     state = condition_on_selections(
-        identifications.start_state(baseline), identifications.identified
+        identifications.state_without_effects(baseline), identifications.identified
     )
     posteriors: list[Posterior] = []
     power = baseline["spectrum"].values.copy()
@@ -91,7 +91,9 @@ def recalibrate(
         posterior = None
         has_walk = expected_processes(state.baseline, row).walk.any()
         if axis_effects is not None and not has_walk:
-            has_unidentified = any(axis in selection.axes for selection in identifications.unknown)
+            has_unidentified = any(
+                axis in selection.axes for selection in identifications.unidentified
+            )
             chosen = use & ~state.masked[row] & (quiet[row] if has_unidentified else True)
             wander = expected_processes(with_processes, row)
             posterior = _fit_noise(state, row, axis_effects, chosen, wander)
@@ -144,7 +146,7 @@ def remove_fast_switching(identifications: Identifications, baseline: xr.Dataset
     )
     if not switching:
         return baseline
-    switching_only = replace(identifications, identified=switching, unknown=())
+    switching_only = replace(identifications, identified=switching, unidentified=())
     noise = recalibrate(switching_only, baseline, fit_identifications(switching_only, baseline))
     return noise if noise is baseline else noise.assign_attrs(recalibrated=[])
 
@@ -200,7 +202,7 @@ def _collect_effects(
     # twice the error of the size, because power grows with its square
     doubt = 2.0 * identifications.state.settings.size_error_share
     out = AxisEffects(np.zeros(shape), np.ones((shape[1], len(NOISE))), doubt)
-    start = identifications.start_state(baseline)
+    start = identifications.state_without_effects(baseline)
     touched = False
     for identification in identifications.identified:
         components = [component for component in identification.components if axis in component.row]

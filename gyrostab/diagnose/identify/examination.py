@@ -1,8 +1,8 @@
-"""What all steps of the selection share, the record and its candidates, and what they find."""
+"""What all steps of the identification share: the record, its candidates and the threshold."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from gyrostab.diagnose.baseline.quantization_grid import rounded_rates
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import EXPECTED, CountEvidence, has_coarse_grid
 from gyrostab.diagnose.identify.components import group_components
-from gyrostab.diagnose.identify.identification import Selection, condition_on_selections, form_error
+from gyrostab.diagnose.identify.selections import Selection, condition_on_selections, form_error
 from gyrostab.diagnose.nulls.scores import fit_best_evidence
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
@@ -84,35 +84,6 @@ class Examination:
         """Return the evidence that components need in addition to the selections [nats]."""
         others = [*self.expected, *selections]
         return self.threshold + form_error(components, others, settings=self.settings)
-
-
-@dataclass(frozen=True)
-class Identifications:
-    """What the identification found."""
-
-    examination: Examination  # with the expected effects in the model
-    identified: tuple[Selection, ...]  # the strongest first
-    unknown: tuple[Selection, ...]
-    state: State  # with all of the above, and the expected effects, in the model
-    candidates: tuple[Candidate, ...]  # all that were tried, for the noise of the state
-    #: Effects that the simulation contains as well, with size and time from the recording.
-    expected: tuple[Selection, ...] = ()
-    #: Key of each candidate that passed the threshold and was not selected -> another form or a
-    #: time-shifted channel, and by how much it explained more [nats].
-    beaten: Mapping[str, tuple[str, float]] = field(default_factory=dict)
-
-    def start_state(self, baseline: xr.Dataset) -> State:
-        """Return the state without any effect."""
-        return initial_state(self.state.blocks, baseline, settings=self.state.settings)
-
-    def state_without(self, identification: Selection, baseline: xr.Dataset) -> State:
-        """Return the state with all selections but one in the model, weighted with all of them."""
-        chosen: list[Selection] = [*self.expected, *self.identified, *self.unknown]
-        return replace(
-            condition_on_selections(self.start_state(baseline), chosen, identification),
-            expected_power=self.state.expected_power,
-            masked=self.state.masked,
-        )
 
 
 def prepare_examination(

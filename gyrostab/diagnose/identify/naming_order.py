@@ -10,7 +10,7 @@ import numpy as np
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, keep_physical
-from gyrostab.diagnose.identify.identification import ambiguous_evidence, form_error, make_selection
+from gyrostab.diagnose.identify.selections import ambiguous_evidence, form_error, make_selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on, mean_columns
 from gyrostab.diagnose.predict.linear_model import State
@@ -22,7 +22,7 @@ def order_passing(
     state: State,
     examination: Examination,
 ) -> list[str]:
-    """Return the keys that pass, in the order in which they are to be named.
+    """Return the keys that are to be named next, in their order; all others wait.
 
     Anomalous samples come first, because they raise powers and means too, and not the other
     way round. Then motion that another sensor confirms, then a bias that switches within
@@ -50,7 +50,7 @@ def order_passing(
         or switching
         or _on_other_axes(_without_slopes(passing, components, state, examination), components)
     )
-    return put_followers_first(first, components, state)
+    return drop_switching_with_a_cause(first, components, state)
 
 
 def _on_other_axes(passing: list[str], components: Mapping[str, Sequence[Component]]) -> list[str]:
@@ -151,7 +151,7 @@ def _confirmed_components(components: Sequence[Component], state: State) -> list
     ]
 
 
-def put_followers_first(
+def drop_switching_with_a_cause(
     passing: list[str], components: Mapping[str, Sequence[Component]], state: State
 ) -> list[str]:
     """Drop telegraph biases while a passing mean that follows a channel may be their cause.
@@ -160,7 +160,7 @@ def put_followers_first(
     leaves switches with it. Therefore the channel comes first where it explains more on the same
     axis, or half of the course of the switching.
     """
-    led = [
+    driven_means = [
         component
         for key in passing
         for component in components[key]
@@ -177,7 +177,7 @@ def put_followers_first(
                 or _explained_share(component, other, state) > state.settings.majority_share
             )
             for component in components[key]
-            for other in led
+            for other in driven_means
         )
     ]
 
@@ -214,7 +214,7 @@ def identify_switching(
     """
     return [
         key
-        for key in put_followers_first(passing, components, state)
+        for key in drop_switching_with_a_cause(passing, components, state)
         if any(
             component.variant.inside.size and not state.given.get(("sub_block", component.row[0]))
             for component in components[key]

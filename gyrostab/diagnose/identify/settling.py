@@ -19,7 +19,7 @@ from gyrostab.diagnose.identify.identifiability import (
     find_spectral_alternatives,
     keep_physical,
 )
-from gyrostab.diagnose.identify.identification import (
+from gyrostab.diagnose.identify.selections import (
     Selection,
     ambiguous_evidence,
     components_of,
@@ -55,7 +55,10 @@ def prune_selections(examination: Examination, chosen: list[Selection]) -> list[
 def settle_selections(
     examination: Examination, chosen: list[Selection]
 ) -> tuple[list[Selection], list[Selection]]:
-    """Finish the identifications, and drop the weakest until all reach their threshold."""
+    """Finish the identifications, and drop the weakest until all reach their threshold.
+
+    Returns what is unidentified, and the finished identifications.
+    """
     while True:
         identified = {
             place: _finish_identification(examination, selection, chosen)
@@ -70,7 +73,8 @@ def settle_selections(
             margin[place] = identification.evidence_nats - max(identification.threshold, required)
         weakest = min(margin, key=lambda place: margin[place], default=None)
         if weakest is None or margin[weakest] >= 0.0:
-            return chosen, list(identified.values())
+            unidentified = [selection for selection in chosen if not selection.is_named]
+            return unidentified, list(identified.values())
         chosen = [*chosen[:weakest], *chosen[weakest + 1 :]]
 
 

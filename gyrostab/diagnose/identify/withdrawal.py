@@ -13,7 +13,7 @@ from gyrostab.diagnose.evidence.mixture import products_mixture
 from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.identify.components import split_layers, sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identification import (
+from gyrostab.diagnose.identify.selections import (
     Selection,
     components_of,
     make_selection,

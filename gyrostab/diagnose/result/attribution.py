@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_motion
-from gyrostab.diagnose.identify.identification import Selection, components_of
+from gyrostab.diagnose.identify.selections import Selection, components_of
 from gyrostab.diagnose.locate.mismatches import Region
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.predict.candidates import Component

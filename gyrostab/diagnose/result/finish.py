@@ -18,8 +18,8 @@ from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_expected, fit_ident
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, refer_to_kept_noise, with_noise
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.identify.components import axes_of, sum_evidence
-from gyrostab.diagnose.identify.examination import Identifications
-from gyrostab.diagnose.identify.identification import Selection, reduce_selection
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import Selection, reduce_selection
 from gyrostab.diagnose.locate.mismatches import Region
 from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.predict.channel_use import unused_channels
@@ -221,7 +221,7 @@ def keep_supported(
     keeps all of its axes, `identifications` itself is returned.
     """
     identified: list[Selection] = []
-    unknown: list[Selection] = []
+    unidentified: list[Selection] = []
     for identification, numbers in zip(identifications.identified, fitted, strict=True):
         good = {axis for fitted_effect in numbers for axis in supported_axes(fitted_effect)}
         if set(identification.axes) <= good or not numbers:
@@ -240,7 +240,7 @@ def keep_supported(
         )
         if sum_evidence(lost) > identification.threshold:
             strongest = max(lost, key=lambda component: component.evidence_nats).statistic
-            unknown.append(
+            unidentified.append(
                 Selection(
                     strongest.nuisance_alternative,
                     (),
@@ -254,5 +254,7 @@ def keep_supported(
     if identified == [*identifications.identified]:
         return identifications
     return replace(
-        identifications, identified=tuple(identified), unknown=(*identifications.unknown, *unknown)
+        identifications,
+        identified=tuple(identified),
+        unidentified=(*identifications.unidentified, *unidentified),
     )

@@ -13,9 +13,10 @@ from gyrostab.diagnose.identify.components import (
     merge_lines,
     sum_evidence,
 )
-from gyrostab.diagnose.identify.examination import NUISANCE_ALTERNATIVES, Identifications
-from gyrostab.diagnose.identify.identification import Selection
-from gyrostab.diagnose.identify.selection import score_candidates
+from gyrostab.diagnose.identify.examination import NUISANCE_ALTERNATIVES
+from gyrostab.diagnose.identify.forward_search import score_candidates
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.identify.settling import find_instead, sum_by_key
 from gyrostab.diagnose.predict.candidates import Component
 
@@ -65,9 +66,9 @@ def find_rejections(identifications: Identifications) -> list[Rejection]:
     examination, state = identifications.examination, identifications.state
     all_evidence = score_candidates(examination, state, ())
     components = merge_lines(group_components(all_evidence, settings=examination.settings))
-    settled = [*identifications.identified, *identifications.unknown]
+    settled = [*identifications.identified, *identifications.unidentified]
     chosen = [*identifications.identified]
-    for selection in identifications.unknown:
+    for selection in identifications.unidentified:
         without = examination.state_with(settled, without=selection)
         instead_of_it, _ = find_instead(examination, selection, without)
         chosen.append(replace(selection, instead=sum_by_key(instead_of_it)))

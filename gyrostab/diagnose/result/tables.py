@@ -17,8 +17,9 @@ from gyrostab.diagnose.estimate.constant_rate import (
 )
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.components import are_lines
-from gyrostab.diagnose.identify.examination import NUISANCE_ALTERNATIVES, Identifications
-from gyrostab.diagnose.identify.identification import Selection, components_of
+from gyrostab.diagnose.identify.examination import NUISANCE_ALTERNATIVES
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import Selection, components_of
 from gyrostab.diagnose.locate.mismatches import Region
 from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
 from gyrostab.diagnose.predict.windows import channel_units, make_windows
@@ -345,7 +346,7 @@ def unidentified_mismatches(
     null = fit_best_evidence(
         identifications.examination.null_best, settings=identifications.state.settings
     )
-    for unidentified in identifications.unknown:
+    for unidentified in identifications.unidentified:
         view = unidentified.components[0].statistic.view
         if any(
             region["view"] == view

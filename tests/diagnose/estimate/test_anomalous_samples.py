@@ -14,7 +14,7 @@ from gyrostab.diagnose.estimate.conditioned_baseline import add_outlier_power, p
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.identify.examination import Identifications
+from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.diagnose.settings import Settings

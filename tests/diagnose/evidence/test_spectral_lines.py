@@ -13,10 +13,10 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence, line_skirt
 from gyrostab.diagnose.evidence.wandering import with_process
-from gyrostab.diagnose.identify import selection
+from gyrostab.diagnose.identify import forward_search
 from gyrostab.diagnose.identify.components import merge_lines
 from gyrostab.diagnose.identify.examination import nuisance_alternatives
-from gyrostab.diagnose.identify.identification import Selection, add_selection, form_error
+from gyrostab.diagnose.identify.selections import Selection, add_selection, form_error
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import undo_filter
@@ -186,7 +186,7 @@ def test_evidence_is_recalled_only_where_nothing_has_changed() -> None:
 
 @pytest.mark.slow
 def test_more_lines_than_are_named_do_not_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(selection, "MAX_LINES", 1)
+    monkeypatch.setattr(forward_search, "MAX_LINES", 1)
     blocks = sines({0.7: 0.3, 2.03: 0.25}, size=6_000, axes=1, jump=0.25)
     baseline, records = nulls(blocks, 20)
     identified = name_effects(blocks, baseline, records).identified

@@ -166,7 +166,7 @@ def test_axis_that_turns_without_a_channel_leaks_into_another():
     identifications = name_effects(blocks, baseline, records)
     at_rest = [other for other in identifications.identified if set(other.axes) & {"x", "y"}]
     assert [(other.effect, other.axes) for other in at_rest] == [("misalignment", ("x",))]
-    assert "z" in {axis for unknown in identifications.unknown for axis in unknown.axes}
+    assert "z" in {axis for selection in identifications.unidentified for axis in selection.axes}
 
 
 @pytest.mark.slow

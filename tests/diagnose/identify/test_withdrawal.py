@@ -13,8 +13,8 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify import withdrawal
 from gyrostab.diagnose.identify.examination import Examination, nuisance_alternatives
-from gyrostab.diagnose.identify.identification import Selection
-from gyrostab.diagnose.identify.selection import _select_all
+from gyrostab.diagnose.identify.forward_search import _select_all
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.identify.withdrawal import variance_fluctuation
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import refit_powers
@@ -115,7 +115,7 @@ def test_smooth_effect_that_stands_for_bursts_is_withdrawn() -> None:
     baseline, records = nulls(blocks, 40)
     identifications = name_effects(blocks, baseline, records)
     assert not identifications.identified
-    assert identifications.unknown
+    assert identifications.unidentified
     steady = record(np.linspace(0.9, 1.15, BLOCKS))
     baseline, records = nulls(steady, 40)
     assert [
@@ -158,5 +158,5 @@ def test_an_axis_that_turns_without_a_channel_has_no_jump_and_no_ageing():
     blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["y"]))
     identifications = name_effects(blocks, *nulls(blocks, 10))
     assert not identifications.identified
-    assert "~red" in {unidentified.effect for unidentified in identifications.unknown}
-    assert {unidentified.axes for unidentified in identifications.unknown} == {("y",)}
+    assert "~red" in {unidentified.effect for unidentified in identifications.unidentified}
+    assert {unidentified.axes for unidentified in identifications.unidentified} == {("y",)}

@@ -19,7 +19,8 @@ _FILTER = "logger_filter"
 class Selection:
     """What forward selection puts into the model: an effect, or a nuisance alternative.
 
-    It is equal only to itself.
+    It is equal only to itself. A variable `identification` holds a selection that `is_named`, one
+    called `selection` may hold either.
     """
 
     #: Name in the registry, or one of

@@ -13,15 +13,16 @@ from gyrostab.diagnose.identify.components import (
     merge_lines,
     sum_evidence,
 )
-from gyrostab.diagnose.identify.examination import Examination, Identifications
+from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import keep_physical, passes_time_shift_test
-from gyrostab.diagnose.identify.identification import (
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.naming_order import find_pair, order_passing, order_rivals
+from gyrostab.diagnose.identify.selections import (
     Selection,
     add_selection,
     ambiguous_evidence,
     make_selection,
 )
-from gyrostab.diagnose.identify.naming_order import find_pair, order_passing, order_rivals
 from gyrostab.diagnose.identify.settling import prune_selections, settle_selections
 from gyrostab.diagnose.identify.withdrawal import withdraw_effects, without_pulses
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
@@ -47,9 +48,9 @@ def identify_effects(examination: Examination) -> Identifications:
     """
     examination = identify_expected_effects(examination)
     selected, beaten = _select_all(examination)
-    chosen, identified = settle_selections(examination, prune_selections(examination, selected))
+    pruned = prune_selections(examination, selected)
+    unidentified, identified = settle_selections(examination, pruned)
     identified = without_pulses(identified, examination.settings)
-    unidentified = [selection for selection in chosen if not selection.is_named]
     remaining, withdrawn = withdraw_effects(examination, identified, unidentified)
     unidentified += withdrawn
     return Identifications(
