@@ -231,7 +231,9 @@ def _identify_effects(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> N
         records(),
         level=task.level / 2.0,
         seed=task.seed,
-        known=[effect for effect in known_effects if effect.name in baseline.attrs["left_out"]],
+        model_effects=[
+            effect for effect in known_effects if effect.name in baseline.attrs["left_out"]
+        ],
         progress=task.progress,
         settings=task.settings,
     )

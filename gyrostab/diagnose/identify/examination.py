@@ -15,7 +15,12 @@ from gyrostab.diagnose.evidence.sample_counts import EXPECTED, CountEvidence, ha
 from gyrostab.diagnose.identify.components import group_components
 from gyrostab.diagnose.identify.selections import Selection, condition_on_selections, form_error
 from gyrostab.diagnose.nulls.scores import fit_best_evidence
-from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
+from gyrostab.diagnose.predict.candidates import (
+    NUISANCE_ALTERNATIVES,
+    Candidate,
+    CandidateEvidence,
+    Component,
+)
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -24,18 +29,6 @@ from gyrostab.diagnose.statistics.candidates import effect_candidates
 from gyrostab.diagnose.statistics.wording import COARSE_ANGLE_GRID
 from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
-
-#: Name -> description, in the order in which they are tried.
-NUISANCE_ALTERNATIVES = {
-    "~bias(t)": "the bias wanders",
-    "~levels": "the bias steps between several levels",
-    "~N(t)": "the noise level changes",
-    "~burst": "the noise level is higher for a while",
-    "~S(f)": "the spectrum has another shape",
-    "~outliers": "the distribution has heavy tails",
-    "~cov": "the axes have noise in common",
-    "~red": "the bias wanders far beyond its noise",
-}
 
 
 @dataclass(frozen=True)
@@ -47,11 +40,12 @@ class Examination:
     count_evidence: CountEvidence
     threshold: float  # evidence [nats] that noise alone exceeds with the false-alarm probability
     start: State  # with the expected effects in the model, once they are identified
-    known: tuple[Effect, ...] = ()  # effects that the simulation contains but not the baseline
+    #: Effects that the simulation contains but not the baseline.
+    model_effects: tuple[Effect, ...] = ()
     #: Best evidence in each null record, sorted [nats].
     null_best: Array = field(default_factory=lambda: np.empty(0))
     reasons: dict[str, str] = field(default_factory=dict)  # effect -> why it cannot show
-    expected: tuple[Selection, ...] = ()  # those of the known effects that the record shows
+    expected: tuple[Selection, ...] = ()  # those of the model that the record shows
 
     @property
     def settings(self) -> Settings:
@@ -93,7 +87,7 @@ def prepare_examination(
     *,
     level: float = 0.005,
     seed: int = 0,
-    known: Sequence[Effect] = (),
+    model_effects: Sequence[Effect] = (),
     progress: Stage = no_stage,
     settings: Settings = DEFAULTS,
 ) -> Examination:
@@ -102,7 +96,7 @@ def prepare_examination(
     The null records come several at a time, with a leading dimension ``record``. With the
     probability `level`, noise alone gives an identification, or something unidentified. `seed` is
     that of the draws for statistics that the null records do not contain. The simulation contains
-    the `known` effects, but not the baseline; they are in the model before the selection begins.
+    the `model_effects`, but not the baseline; they are in the model before the selection begins.
     """
     folds = fold_blocks(blocks)
     effects, reasons = effect_candidates(blocks, baseline["coefficient"], settings=settings)
@@ -119,7 +113,7 @@ def prepare_examination(
         )
     threshold = fit_best_evidence(best, settings=settings).level(level)
     return Examination(
-        candidates, folds, count_evidence, threshold, start, tuple(known), best, reasons
+        candidates, folds, count_evidence, threshold, start, tuple(model_effects), best, reasons
     )
 
 

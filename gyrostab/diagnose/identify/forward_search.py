@@ -25,7 +25,12 @@ from gyrostab.diagnose.identify.selections import (
 )
 from gyrostab.diagnose.identify.settling import prune_selections, settle_selections
 from gyrostab.diagnose.identify.withdrawal import withdraw_effects, without_pulses
-from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
+from gyrostab.diagnose.predict.candidates import (
+    Candidate,
+    CandidateEvidence,
+    Component,
+    is_nuisance,
+)
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import combine_rows
@@ -187,7 +192,7 @@ def _select_next(
         for key, effect_components in components.items()
     }
     for key, effect_components in list(components.items()):
-        if not key.startswith("~") and sum_evidence(effect_components) > required[key]:
+        if not is_nuisance(key) and sum_evidence(effect_components) > required[key]:
             components[key], better_form = keep_physical(
                 effect_components, state, error=required[key] - examination.threshold
             )
@@ -228,7 +233,7 @@ def _select_next(
     if failed:
         return [], failed
     alternative = passing[0]
-    effects = [key for key in passing if not key.startswith("~")]
+    effects = [key for key in passing if not is_nuisance(key)]
     nearest = [components[key][0].candidate.effect for key in effects[:3]]
     return [
         make_selection(components[alternative], required[alternative], alternatives=nearest)
@@ -256,7 +261,7 @@ def identify_expected_effects(examination: Examination) -> Examination:
     it adds evidence.
     """
     identified: list[Selection] = []
-    state, remaining = examination.start, list(examination.known)
+    state, remaining = examination.start, list(examination.model_effects)
     needed = examination.settings.component_nats
     rounds = MAX_ROUNDS_PER_EFFECT * len(remaining)
     while remaining and rounds > 0:

@@ -11,7 +11,7 @@ from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, keep_physical
 from gyrostab.diagnose.identify.selections import ambiguous_evidence, form_error, make_selection
-from gyrostab.diagnose.predict.candidates import Candidate, Component
+from gyrostab.diagnose.predict.candidates import Candidate, Component, is_nuisance
 from gyrostab.diagnose.predict.condition import condition_on, mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 
@@ -33,7 +33,7 @@ def order_passing(
     counts = [
         key
         for key in passing
-        if components[key][0].candidate.statistic.is_count and not key.startswith("~")
+        if components[key][0].candidate.statistic.is_count and not is_nuisance(key)
     ]
     confirmed = [
         key
@@ -59,9 +59,9 @@ def _on_other_axes(passing: list[str], components: Mapping[str, Sequence[Compone
     An axis that moves, for instance, has much that no effect explains. What another axis senses of
     it by its misalignment does not compete with that.
     """
-    if not passing or not passing[0].startswith("~"):
+    if not passing or not is_nuisance(passing[0]):
         return passing
-    alternatives = [key for key in passing if key.startswith("~")]
+    alternatives = [key for key in passing if is_nuisance(key)]
     first = []
     for key in passing:
         axes = {axis for component in components[key] for axis in component.row}
@@ -86,7 +86,7 @@ def order_rivals(
     rivals = [
         key
         for key in passing
-        if not key.startswith("~")
+        if not is_nuisance(key)
         and sum_evidence(components[key])
         >= ambiguous_evidence(components[key][:1], best, settings=settings)
     ]
@@ -245,7 +245,7 @@ def find_pair(
     keys = [
         key
         for key in passing
-        if not key.startswith("~")
+        if not is_nuisance(key)
         and (
             components[key][0].statistic is alternative[0].statistic
             or (is_in_means and components[key][0].statistic.is_linear_in_means)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from gyrostab.diagnose.identify.components import are_lines, axes_of, sum_evidence
-from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.candidates import Component, is_nuisance
 from gyrostab.diagnose.predict.condition import condition_on_components, refit_powers
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -23,9 +23,7 @@ class Selection:
     called `selection` may hold either.
     """
 
-    #: Name in the registry, or one of
-    #: `gyrostab.diagnose.identify.examination.NUISANCE_ALTERNATIVES`.
-    effect: str
+    effect: str  # name in the registry, or one of `NUISANCE_ALTERNATIVES`
     driver: tuple[str, ...]  # channels of the log that it follows, in the order of the effect's
     axes: tuple[str, ...]
     components: tuple[Component, ...]  # statistics and rows in which it shows
@@ -40,7 +38,7 @@ class Selection:
     @property
     def is_named(self) -> bool:
         """Whether it is an effect."""
-        return not self.effect.startswith("~")
+        return not is_nuisance(self.effect)
 
 
 def components_of(chosen: Iterable[Selection]) -> list[Component]:

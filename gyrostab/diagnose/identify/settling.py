@@ -25,7 +25,7 @@ from gyrostab.diagnose.identify.selections import (
     components_of,
     with_axes_of,
 )
-from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.candidates import Component, is_nuisance
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 
@@ -97,7 +97,7 @@ def _finish_identification(
         for other, components in on_axes.items()
         if components
         and other != key
-        and not other.startswith("~")
+        and not is_nuisance(other)
         and sum_evidence(components) >= min_nats
         and sum_evidence(keep_physical(components, state)[0]) >= min_nats
     ]

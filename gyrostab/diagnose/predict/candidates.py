@@ -35,6 +35,23 @@ def content_digest(*items: Array | bytes | None) -> bytes:
 
 #: Nuisance parameter that is a time.
 TIME_PARAMETER = "at"
+#: Nuisance alternative -> description, in the order in which they are tried. Their names begin with
+#: "~", those of effects do not.
+NUISANCE_ALTERNATIVES = {
+    "~bias(t)": "the bias wanders",
+    "~levels": "the bias steps between several levels",
+    "~N(t)": "the noise level changes",
+    "~burst": "the noise level is higher for a while",
+    "~S(f)": "the spectrum has another shape",
+    "~outliers": "the distribution has heavy tails",
+    "~cov": "the axes have noise in common",
+    "~red": "the bias wanders far beyond its noise",
+}
+
+
+def is_nuisance(name: str) -> bool:
+    """Return whether a name, or the key of a candidate, is that of a nuisance alternative."""
+    return name.startswith("~")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +97,7 @@ class Prospect(NamedTuple):
 class Candidate:
     """An effect in one statistic."""
 
-    effect: str  # name in the registry; that of a nuisance alternative begins with "~"
+    effect: str  # name in the registry, or one of `NUISANCE_ALTERNATIVES`
     statistic: Statistic  # one of `gyrostab.diagnose.statistics.STATISTICS`
     #: Channels of the log that it follows, in the order of the effect's channels; an empty string
     #: for a missing one.

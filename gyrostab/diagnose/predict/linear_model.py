@@ -196,24 +196,25 @@ def linear_model(
     designs: Iterable[Iterable[Array]],
     given: Sequence[Array],
     *,
-    known: Sequence[Array] = (),
+    noise_columns: Sequence[Array] = (),
     precision: Any = (),
     is_bounded: Sequence[bool] = (),
     low: Sequence[float] = (),
 ) -> LinearModel:
     """Return a linear model of cells (block, cell) from columns of any shape that suits them.
 
-    The given columns are known ones with a prior precision, and nearly free ones of named effects;
-    `low` are their least sizes, if any. The sizes of designs cannot be negative where `is_bounded`.
+    In the model without a design are `noise_columns` with a prior `precision`, and nearly free ones
+    of named effects, which are `given`; `low` are the least sizes of both, if any. The sizes of
+    designs cannot be negative where `is_bounded`.
     """
     return LinearModel(
         values,
         weight,
         [stack_columns(design, weight.shape) for design in designs],
-        stack_columns([*known, *given], weight.shape),
+        stack_columns([*noise_columns, *given], weight.shape),
         np.diag([*precision, *[-1.0] * len(given)]),
         is_bounded,
-        np.array(low) if len(low) else np.full(len(known) + len(given), -np.inf),
+        np.array(low) if len(low) else np.full(len(noise_columns) + len(given), -np.inf),
     )
 
 

@@ -13,12 +13,11 @@ from gyrostab.diagnose.identify.components import (
     merge_lines,
     sum_evidence,
 )
-from gyrostab.diagnose.identify.examination import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.identify.forward_search import score_candidates
 from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.identify.settling import find_instead, sum_by_key
-from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.candidates import NUISANCE_ALTERNATIVES, Component, is_nuisance
 
 _NOISE = "noise"
 
@@ -78,7 +77,7 @@ def find_rejections(identifications: Identifications) -> list[Rejection]:
     out: dict[str, tuple[float, Rejection]] = {}
     for key, effect_components in components.items():
         effect = effect_components[0].candidate.effect
-        if key.startswith("~") or effect in named:
+        if is_nuisance(key) or effect in named:
             continue
         added_nats = sum_evidence(effect_components)
         required = examination.required_nats(effect_components, chosen)

@@ -17,11 +17,11 @@ from gyrostab.diagnose.estimate.constant_rate import (
 )
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.components import are_lines
-from gyrostab.diagnose.identify.examination import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.identify.selections import Selection, components_of
 from gyrostab.diagnose.locate.mismatches import Region
 from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
+from gyrostab.diagnose.predict.candidates import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.predict.windows import channel_units, make_windows
 from gyrostab.diagnose.reduce.block_statistics import iso, measured
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks

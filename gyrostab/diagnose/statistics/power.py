@@ -153,7 +153,7 @@ class Power(Statistic):
                 candidates, lambda density: mix_with_mean(select_row(density, row), unspread, width)
             ),
             state.power_columns(axis),
-            known=[level[..., number] * expected for number in range(level.shape[2])],
+            noise_columns=[level[..., number] * expected for number in range(level.shape[2])],
             precision=np.diagonal(precision),
             is_bounded=[
                 variant.squared for candidate in candidates for variant in candidate.variants

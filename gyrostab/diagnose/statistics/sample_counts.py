@@ -25,6 +25,7 @@ from gyrostab.diagnose.predict.candidates import (
     Component,
     Prospect,
     Variant,
+    is_nuisance,
 )
 from gyrostab.diagnose.predict.condition import free_shape
 from gyrostab.diagnose.predict.linear_model import State, cross_without
@@ -251,9 +252,8 @@ def _count_evidence(
 
 def _is_everywhere(component: Component) -> bool:
     """Return whether the samples are anomalous in all blocks alike."""
-    return (
-        component.candidate.effect == "rate_quantization"
-        or component.candidate.effect.startswith("~")
+    return component.candidate.effect == "rate_quantization" or is_nuisance(
+        component.candidate.effect
     )
 
 
