@@ -25,7 +25,7 @@ class Trial(NamedTuple):
     data: xr.Dataset
     state: State
     folds: xr.DataArray
-    counts: CountEvidence | None = None
+    count_evidence: CountEvidence | None = None
     rng: np.random.Generator | None = None
 
     @property

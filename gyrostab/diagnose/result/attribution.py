@@ -411,7 +411,7 @@ def needed_effects(
         for identification, components in shown
         if all(
             # a low-pass may be in the noise of the baseline already
-            str(region["view"]) in component.statistic.contained_in and not component.is_filter
+            str(region["view"]) in component.statistic.containing_views and not component.is_filter
             for component in components
         )
     ]

@@ -242,7 +242,7 @@ def keep_supported(
             strongest = max(lost, key=lambda component: component.evidence_nats).statistic
             unidentified.append(
                 Selection(
-                    strongest.nuisance_alternative,
+                    strongest.unsupported_as,
                     (),
                     axes_of(lost, identification.axes),
                     lost,

@@ -57,7 +57,7 @@ class SizeFit:
     state: State  # with all other effects in the model
     #: All that were tried; they have the grids of nuisance parameters.
     candidates: Sequence[Candidate]
-    counts: CountEvidence  # expected sample counts
+    count_evidence: CountEvidence  # expected sample counts
     #: Filled by an estimate that averages over a grid: the values at its likeliest point.
     likeliest: dict[str, float | str] = field(default_factory=dict)
 
@@ -79,35 +79,40 @@ class Statistic:
 
     name: str  # unique
     view: str  # the key ``view`` of its mismatches in diagnosis.json
-    explains: tuple[str, ...] = ()  # kinds of mismatches that an effect in it can explain
-    #: Kinds of mismatches whose score against the baseline with effects contains what an effect in
-    #: this statistic contributes.
-    contained_in: tuple[str, ...] = ()
-    #: As what the rest of an effect is reported that explains too little in this statistic.
-    nuisance_alternative = "~S(f)"
+    #: `view` of each mismatch that an effect in it can explain.
+    explained_views: tuple[str, ...] = ()
+    #: `view` of each mismatch whose score against the baseline with effects contains what an effect
+    #: in this statistic contributes.
+    containing_views: tuple[str, ...] = ()
+    #: Nuisance alternative as which an effect is reported on the axes where it shows in this
+    #: statistic and its size may be zero (`gyrostab.diagnose.result.finish.keep_supported`).
+    unsupported_as = "~S(f)"
     error_shows_in: tuple[str, ...] = ()  # statistics that show an error of the form of an effect
     #: Variable of the null records that the evidence uses; "" to draw noise of the linear model.
     null_variable = ""
-    is_power_weighted = False  # whether the expected powers are its weights
-    is_phase_locked = False  # whether it is locked to the rotation of the tool or to the ramp
-    is_in_baseline = False  # whether the baseline with the effects contains what an effect adds
-    is_in_means = False  # whether effects move the block means,
-    is_linear_in_means = False  # by columns,
-    is_switching = False  # by two levels of free course
-    is_random_bias = False  # by a bias of random course, which no other data predict
-    is_power = False  # whether effects add power,
-    is_pairwise = False  # covariance of two axes,
-    is_rotation = False  # amplitudes at multiples of the rotation,
-    is_transfer = False  # what follows a reference channel,
-    is_line = False  # a spectral line,
-    is_count = False  # anomalous samples
-    has_course = False  # whether designs are by block
-    has_size = True  # whether the size follows from a linear model
-    uses_line_spectra = False  # whether the score is of the spectrum at full resolution
-    is_ratio = False  # whether the score is of a variance over the expected one
-    grows_in_time = True  # whether adjacent regions of a mismatch are one
-    is_tried_last = False  # whether an effect in it explains only what nothing else does
-    takes_noise = True  # whether an effect takes a share of the noise of an axis
+    # what an effect does
+    is_in_means = False  # effects move the block means
+    is_linear_in_means = False  # effects move the block means by columns of a linear model
+    is_switching = False  # effects move the block means between two levels of free course
+    is_random_bias = False  # effects add a bias of random course, which no other data predict
+    is_power = False  # effects add power
+    is_pairwise = False  # effects add a covariance of two axes
+    is_rotation = False  # effects add amplitudes at multiples of the rotation
+    is_phase_locked = False  # effects are locked to the rotation of the tool or to the ramp
+    is_transfer = False  # effects add what follows a reference channel
+    is_line = False  # effects add a spectral line
+    is_count = False  # effects cause anomalous samples
+    is_in_baseline = False  # `predict_baseline` includes what an effect adds
+    takes_noise = True  # an effect takes a share of the noise of an axis
+    # how effects are searched and fitted
+    has_course = False  # designs are by block, so that an effect may act in part of the record
+    has_size = True  # the size follows from a linear model
+    is_power_weighted = False  # the expected powers give the weights of the data
+    is_tried_last = False  # an effect explains only what no other statistic does
+    # how mismatches are scored
+    uses_line_spectra = False  # the score is of the spectrum at full resolution
+    is_ratio = False  # the score is of a variance over the expected one
+    grows_in_time = True  # adjacent regions of a mismatch are one
 
     def __repr__(self) -> str:
         return f"<{self.name}>"
@@ -301,7 +306,7 @@ class Statistic:
         self, component: Component, region: Region, blocks: xr.Dataset, settings: Settings
     ) -> bool:
         """Return whether a component of an effect can show in a mismatch."""
-        return str(region["view"]) in self.explains
+        return str(region["view"]) in self.explained_views
 
     def is_modelled_in(self, region: Region, *, together: bool) -> bool:
         """Return whether the baseline with the effects contains what an effect does to a mismatch.

@@ -58,9 +58,9 @@ class CrossSpectrum(Statistic):
 
     name = "cross_spectrum"
     view = "cross_axis"
-    explains = ("cross_axis", "davar")
-    contained_in = ("davar", "cross_axis")
-    nuisance_alternative = "~cov"
+    explained_views = ("cross_axis", "davar")
+    containing_views = ("davar", "cross_axis")
+    unsupported_as = "~cov"
     error_shows_in = ("cross_spectrum",)
     null_variable = "cross"
     is_power_weighted = True

@@ -72,7 +72,7 @@ class BlockMeanStatistic(Statistic):
     """What statistics of effects in the block means share."""
 
     view = "mean"
-    explains: tuple[str, ...] = (
+    explained_views: tuple[str, ...] = (
         "mean",
         "restart",
         "davar",
@@ -80,8 +80,8 @@ class BlockMeanStatistic(Statistic):
         "cross_axis",
         "spectrum",
     )
-    contained_in: tuple[str, ...] = ("davar", "mean", "restart", "cross_axis")
-    nuisance_alternative = "~bias(t)"
+    containing_views: tuple[str, ...] = ("davar", "mean", "restart", "cross_axis")
+    unsupported_as = "~bias(t)"
     error_shows_in = ("mean",)
     is_in_baseline = True
 
@@ -103,7 +103,7 @@ class BlockMeanStatistic(Statistic):
     ) -> bool:
         """Return whether the mismatch is one of means; of several axes only a slow one."""
         is_slow = region["view"] != "cross_axis" or region["what"] == "slow"
-        return str(region["view"]) in self.explains and bool(is_slow)
+        return str(region["view"]) in self.explained_views and bool(is_slow)
 
     def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
         return float(blocks.attrs["block_s"]), float(blocks["end"].values[-1]) / 2.0

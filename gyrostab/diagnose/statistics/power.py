@@ -53,9 +53,9 @@ class Power(Statistic):
 
     name = "power"
     view = "davar"
-    explains = ("davar", "spectrum", "distribution")
-    contained_in = ("davar", "distribution")
-    nuisance_alternative = "~N(t)"
+    explained_views = ("davar", "spectrum", "distribution")
+    containing_views = ("davar", "distribution")
+    unsupported_as = "~N(t)"
     error_shows_in = ("power",)
     null_variable = "power"
     is_power_weighted = True

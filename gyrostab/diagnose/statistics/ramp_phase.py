@@ -43,8 +43,8 @@ class RampPhase(Statistic):
 
     name = "ramp_phase"
     view = "spectrum"
-    explains = ("spectrum", "davar", "distribution", "mean")
-    contained_in = ("davar",)
+    explained_views = ("spectrum", "davar", "distribution", "mean")
+    containing_views = ("davar",)
     error_shows_in = ("ramp_phase",)
     is_power_weighted = True
     is_phase_locked = True

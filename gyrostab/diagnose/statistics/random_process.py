@@ -46,9 +46,9 @@ class RandomProcess(BlockMeanStatistic):
     """
 
     name = "random_process"
-    explains = ("mean", "davar", "restart", "cross_axis")
-    contained_in = ()
-    nuisance_alternative = "~red"
+    explained_views = ("mean", "davar", "restart", "cross_axis")
+    containing_views = ()
+    unsupported_as = "~red"
     null_variable = "mean"
     error_shows_in = ("random_process",)
     has_course = True

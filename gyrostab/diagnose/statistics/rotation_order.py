@@ -39,8 +39,8 @@ class RotationOrder(Statistic):
 
     name = "rotation_order"
     view = "spectrum"
-    explains = ("spectrum", "davar", "mean", "distribution", "cross_axis")
-    contained_in = ("davar",)
+    explained_views = ("spectrum", "davar", "mean", "distribution", "cross_axis")
+    containing_views = ("davar",)
     error_shows_in = ("rotation_order", "power", "cross_spectrum")
     is_power_weighted = True
     is_phase_locked = True

@@ -46,9 +46,9 @@ from gyrostab.diagnose.statistics.wording import subject
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (1, 5, 15)
-#: Counts of samples.
-COUNTS = ("outliers", "repeats", "extremes", "zeros")
-_SAMPLES = {
+#: Counts whose mismatches are located.
+SCORED_COUNTS = ("outliers", "repeats", "extremes", "zeros")
+_COUNT_TEXTS = {
     "outliers": "outliers",
     "repeats": "more repeated samples than noise produces",
     "extremes": "many samples at the same smallest or largest value",
@@ -77,9 +77,9 @@ class SampleCounts(Statistic):
 
     name = "sample_counts"
     view = "distribution"
-    explains = ("distribution", "davar", "spectrum", "cross_axis")
-    contained_in = ("davar", "mean", "restart", "cross_axis")
-    nuisance_alternative = "~outliers"
+    explained_views = ("distribution", "davar", "spectrum", "cross_axis")
+    containing_views = ("davar", "mean", "restart", "cross_axis")
+    unsupported_as = "~outliers"
     error_shows_in = ("sample_counts",)
     is_count = True
     has_size = False
@@ -102,11 +102,11 @@ class SampleCounts(Statistic):
         windows = window_set(blocks.sizes["block"], LENGTHS)
         samples = blocks["samples"].values.astype(float)
         counts_by_block = {
-            name: np.nan_to_num(blocks[name].values.astype(float)) for name in COUNTS
+            name: np.nan_to_num(blocks[name].values.astype(float)) for name in SCORED_COUNTS
         }
         counts_by_block["extremes"] = excess_extremes(counts_by_block["extremes"])
         counts = sum_over_windows(
-            np.stack([counts_by_block[name] for name in COUNTS], axis=-1), windows
+            np.stack([counts_by_block[name] for name in SCORED_COUNTS], axis=-1), windows
         )
         tail_score, used = _kurtosis_score(blocks["kurtosis"].values, samples)
         # Rounding has no tails, so that the noise itself may differ from 0.
@@ -123,13 +123,15 @@ class SampleCounts(Statistic):
         rate = float(blocks.attrs["sampling_rate_hz"])
         number = np.concatenate([counts, np.broadcast_to(mean, tails.shape)], axis=-1)
         z = np.concatenate([2.0 * np.sqrt(counts + 0.375), tails], axis=-1)
-        hidden = np.stack([hidden_by_grid(blocks, name) for name in (*COUNTS, "kurtosis")], axis=-1)
+        hidden = np.stack(
+            [hidden_by_grid(blocks, name) for name in (*SCORED_COUNTS, "kurtosis")], axis=-1
+        )
         z = np.where(hidden[:, None, :], np.nan, z)
         return statistic_dataset(
             blocks,
             windows=windows,
             columns={
-                "what": [*COUNTS, "kurtosis"],
+                "what": [*SCORED_COUNTS, "kurtosis"],
                 "tau_min_s": 1.0 / rate,
                 "tau_max_s": 1.0 / rate,
                 "floor": _MIN_SCATTER,
@@ -145,7 +147,7 @@ class SampleCounts(Statistic):
             yield Variant(case.values, case.prediction.marks, np.empty(0))
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
-        if trial.counts is None:
+        if trial.count_evidence is None:
             return []
         subsets = fold_subsets(trial.folds)
         rows = self.rows(group[0], trial.state)
@@ -158,7 +160,9 @@ class SampleCounts(Statistic):
                     np.where(
                         hidden_by_grid(trial.state.blocks, name) | (sticks & (name == "repeats")),
                         0.0,
-                        _count_evidence(name, trial.data, trial.state, subsets, trial.counts),
+                        _count_evidence(
+                            name, trial.data, trial.state, subsets, trial.count_evidence
+                        ),
                     )
                     for name in variant.columns
                 ]
@@ -191,7 +195,7 @@ class SampleCounts(Statistic):
             fit.components[0].variant.columns[0],
             fit.components[0].row[0],
             fit.state.blocks,
-            fit.counts,
+            fit.count_evidence,
             fit.state.settings,
         )
 
@@ -200,7 +204,7 @@ class SampleCounts(Statistic):
         return bool(region["view"] == "cross_axis")
 
     def describe(self, region: Region, when: str) -> str:
-        samples = _SAMPLES.get(str(region["what"]), "an unusual distribution of its samples")
+        samples = _COUNT_TEXTS.get(str(region["what"]), "an unusual distribution of its samples")
         verb = "has" if len(region["axes"]) == 1 else "have"
         return f"{subject(region)} {verb} {samples} {when}"
 

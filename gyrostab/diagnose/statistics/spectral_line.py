@@ -60,8 +60,8 @@ class SpectralLine(Statistic):
 
     name = "spectral_line"
     view = "spectrum"
-    explains = ("spectrum", "davar", "distribution", "cross_axis")
-    contained_in = ("davar", "cross_axis")
+    explained_views = ("spectrum", "davar", "distribution", "cross_axis")
+    containing_views = ("davar", "cross_axis")
     is_line = True
     has_size = False
     uses_line_spectra = True
@@ -205,7 +205,7 @@ class SpectralLine(Statistic):
         self, component: Component, region: Region, blocks: xr.Dataset, settings: Settings
     ) -> bool:
         """Return whether a mismatch is at the frequency of the line, or of samples."""
-        if str(region["view"]) not in self.explains:
+        if str(region["view"]) not in self.explained_views:
             return False
         if region["view"] == "cross_axis":
             return str(region["what"]) != "slow"

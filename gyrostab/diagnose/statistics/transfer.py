@@ -38,8 +38,8 @@ class Transfer(Statistic):
 
     name = "transfer"
     view = "davar"
-    explains = ("davar", "cross_axis", "spectrum", "mean", "distribution")
-    contained_in = ("davar",)
+    explained_views = ("davar", "cross_axis", "spectrum", "mean", "distribution")
+    containing_views = ("davar",)
     error_shows_in = ("transfer",)
     is_power_weighted = True
     is_transfer = True
