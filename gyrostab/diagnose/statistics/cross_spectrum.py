@@ -122,13 +122,13 @@ class CrossSpectrum(Statistic):
             estimate=r,
         )
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield cross-densities per product of the factors of both axes."""
-        prediction = case.prediction
+        prediction = prospect.prediction
         if not prediction.coherent or prediction.line is not None:
             return
         for name, density in prediction.spectrum.items():
-            yield Variant(case.values, (name,), with_axis(density)[None], squared=True)
+            yield Variant(prospect.values, (name,), with_axis(density)[None], squared=True)
 
     def rows(self, candidate: Candidate, state: State) -> list[tuple[str, ...]]:
         return pair_rows(state.blocks)

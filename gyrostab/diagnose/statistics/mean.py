@@ -161,16 +161,16 @@ class Mean(BlockMeanStatistic):
             estimate=estimate,
         )
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield designs of the mean that are not constant; the constant is free."""
         columns = {}
-        for name, design in case.prediction.mean.items():
+        for name, design in prospect.prediction.mean.items():
             moved = design - design.mean(axis=-1, keepdims=True)
             if np.isfinite(moved).all() and np.abs(moved).max() > 1e-9 * np.abs(design).max(
                 initial=1e-300
             ):
                 columns[name] = design
-        yield from choose_columns(case.values, columns)
+        yield from choose_columns(prospect.values, columns)
 
     def complete_candidate(
         self, candidate: Candidate, kind: type[Effect], windows: PredictionWindows

@@ -96,19 +96,19 @@ class Power(Statistic):
             ratio=ratio,
         )
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield added densities; for a filter what it adds or removes at its full size.
 
         Constant coherent densities are left to the cross-spectra.
         """
-        frequency = case.blocks["frequency"].values
-        rate = float(case.blocks.attrs["sampling_rate_hz"])
+        frequency = prospect.blocks["frequency"].values
+        rate = float(prospect.blocks.attrs["sampling_rate_hz"])
         level: dict[str, Floats] = {}
-        for (symbol, name), share in case.prediction.level.items():
+        for (symbol, name), share in prospect.prediction.level.items():
             square = (
-                case.coefficient.sel(term=symbol).values ** 2
-                if symbol in case.coefficient["term"].values
-                else np.zeros(case.coefficient.sizes["axis"])
+                prospect.coefficient.sel(term=symbol).values ** 2
+                if symbol in prospect.coefficient["term"].values
+                else np.zeros(prospect.coefficient.sizes["axis"])
             )
             component = (
                 np.atleast_2d(share)[..., None]
@@ -117,12 +117,12 @@ class Power(Statistic):
             )
             level[name] = level.get(name, 0.0) + component
         spectrum = {}
-        if case.prediction.line is None:
+        if prospect.prediction.line is None:
             spectrum = {
                 name: with_axis(density)
-                for name, density in case.prediction.spectrum.items()
-                if (_changes_over_time(density) or not case.prediction.coherent)
-                and not is_correlated_bias(name, case.prediction, case.blocks)
+                for name, density in prospect.prediction.spectrum.items()
+                if (_changes_over_time(density) or not prospect.prediction.coherent)
+                and not is_correlated_bias(name, prospect.prediction, prospect.blocks)
             }
         for columns, squared in ((level, False), (spectrum, True)):
             densities = {
@@ -130,11 +130,11 @@ class Power(Statistic):
                 for name, density in columns.items()
                 if np.abs(density).max(initial=0.0) > 0 and not _is_white_and_constant(density)
             }
-            yield from choose_columns(case.values, densities, squared=squared)
-        response = case.prediction.response
+            yield from choose_columns(prospect.values, densities, squared=squared)
+        response = prospect.prediction.response
         if response:  # on noise as it was logged, whose N contains the aliases
-            change = _filter_change(response["N"], case.coefficient, frequency, rate)
-            yield Variant(case.values, (), change[None])
+            change = _filter_change(response["N"], prospect.coefficient, frequency, rate)
+            yield Variant(prospect.values, (), change[None])
 
     def model(
         self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State

@@ -104,16 +104,16 @@ class RampPhase(Statistic):
             one_sided=True,
         )
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield profiles that change over the phase."""
-        if "profile" not in case.blocks:
+        if "profile" not in prospect.blocks:
             return
         profiles = {
             name: design
-            for name, design in case.prediction.phase_locked.items()
+            for name, design in prospect.prediction.phase_locked.items()
             if np.isfinite(design).all() and np.ptp(design) > 0
         }
-        yield from choose_columns(case.values, profiles)
+        yield from choose_columns(prospect.values, profiles)
 
     def model(
         self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State

@@ -55,11 +55,11 @@ class RandomProcess(BlockMeanStatistic):
     has_size = False
     takes_noise = False
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield random walks whose strength changes in time."""
-        for name, (time, variance) in case.prediction.wander.items():
+        for name, (time, variance) in prospect.prediction.wander.items():
             if np.isinf(time) and np.ptp(variance) > 0.0:
-                yield Variant(case.values, (name,), np.asarray(variance)[None], squared=True)
+                yield Variant(prospect.values, (name,), np.asarray(variance)[None], squared=True)
 
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
         """Return a steady random walk beyond that of the calibration."""

@@ -68,13 +68,13 @@ class RotationOrder(Statistic):
         variance = 2.0 * noise_at_orders(blocks, density) * rate / samples
         return {"order": np.sqrt(variance) * noise}
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield patterns of the harmonics over the axes."""
-        if "order" not in case.blocks:
+        if "order" not in prospect.blocks:
             return
-        count = case.blocks.sizes["harmonic"]
-        for name, pattern in case.prediction.order.items():
-            yield Variant(case.values, (name,), pattern[None, :, :count])
+        count = prospect.blocks.sizes["harmonic"]
+        for name, pattern in prospect.prediction.order.items():
+            yield Variant(prospect.values, (name,), pattern[None, :, :count])
 
     def complete_candidate(
         self, candidate: Candidate, kind: type[Effect], windows: EffectWindows

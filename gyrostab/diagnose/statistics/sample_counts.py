@@ -141,10 +141,10 @@ class SampleCounts(Statistic):
             estimate=number,
         )
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield the counts that the effect raises."""
-        if case.prediction.marks:
-            yield Variant(case.values, case.prediction.marks, np.empty(0))
+        if prospect.prediction.marks:
+            yield Variant(prospect.values, prospect.prediction.marks, np.empty(0))
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
         if trial.count_evidence is None:

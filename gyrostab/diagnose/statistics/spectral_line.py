@@ -102,15 +102,15 @@ class SpectralLine(Statistic):
             one_sided=True,
         )
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield a line of constant frequency; the spectrum itself determines the frequency."""
         if (
-            case.prediction.line is None
-            or not case.prediction.coherent
-            or np.ptp(case.prediction.line) > 0
+            prospect.prediction.line is None
+            or not prospect.prediction.coherent
+            or np.ptp(prospect.prediction.line) > 0
         ):
             return
-        yield Variant({}, tuple(case.prediction.spectrum), np.empty(0), squared=True)
+        yield Variant({}, tuple(prospect.prediction.spectrum), np.empty(0), squared=True)
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
         """Compute the evidence of one line on all axes, of any phase or of constant phase.

@@ -66,11 +66,11 @@ class Transfer(Statistic):
         """
         usable = {*_reference_channels(blocks), *windows.axes}
         by_channel: dict[str, list[Variant]] = {}
-        for case in prospects:
-            for (parameter, channel), transfer in case.prediction.transfer.items():
+        for prospect in prospects:
+            for (parameter, channel), transfer in prospect.prediction.transfer.items():
                 if channel in usable:
                     by_channel.setdefault(channel, []).append(
-                        Variant(case.values, (parameter,), np.asarray(transfer)[None])
+                        Variant(prospect.values, (parameter,), np.asarray(transfer)[None])
                     )
         is_without_channel = kind.name == "real_motion" and not driver
         if is_without_channel or (by_channel and kind.stage == "motion"):

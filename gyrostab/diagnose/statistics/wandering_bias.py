@@ -50,12 +50,12 @@ class WanderingBias(RandomProcess):
     is_random_bias = True
     is_tried_last = True  # it resembles any slow course
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield a bias without a course that the block means show."""
-        for name, (time, variance) in case.prediction.wander.items():
-            if is_correlated_bias(name, case.prediction, case.blocks):
+        for name, (time, variance) in prospect.prediction.wander.items():
+            if is_correlated_bias(name, prospect.prediction, prospect.blocks):
                 yield Variant(
-                    case.values, (name,), np.asarray(variance)[None], squared=True, time=time
+                    prospect.values, (name,), np.asarray(variance)[None], squared=True, time=time
                 )
 
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
