@@ -32,7 +32,7 @@ from gyrostab.diagnose.baseline.posterior import (
 )
 from gyrostab.diagnose.evidence.held_out import mean_residual
 from gyrostab.diagnose.evidence.wandering import add_correlated, expected_processes
-from gyrostab.diagnose.predict.condition import fit_powers
+from gyrostab.diagnose.predict.condition import SCORING_STEPS, fit_powers
 from gyrostab.diagnose.predict.linear_model import (
     State,
     band_widths,
@@ -45,7 +45,6 @@ from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.units import HOUR
 
 _MIN_NOISE_SHARE = 0.05  # of the power of Q and N, that effects may leave; design choice
-_SCORING_STEPS = 4  # of Fisher scoring, as in `gyrostab.diagnose.predict.condition`
 _MIN_CHANGE = 1e-6  # of the expected powers, from which effects change them; above rounding errors
 _LEVEL_GROUPS = 30  # of blocks of similar power, where effects change it; limits time
 #: Range of the density of the bias at low frequencies, over that of white noise. Design choice.
@@ -116,7 +115,7 @@ class _AxisRecord:
         """Return the expected powers, those of the likeliest Q and N added (Fisher scoring)."""
         columns, least = self.fit.columns[:, :2], _MIN_NOISE_SHARE * self.noise
         expected = np.maximum(self.noise + added, least)
-        for _ in range(_SCORING_STEPS):
+        for _ in range(SCORING_STEPS):
             weighted = columns.T * (self.fit.weight / expected**2)[:, None]
             right = (weighted @ (self.fit.power - added)[..., None])[..., 0]
             square = solve_nonnegative(weighted @ columns, right)

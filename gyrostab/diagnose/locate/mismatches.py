@@ -21,7 +21,10 @@ from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 #: (observed over expected; for means and restarts the number of standard deviations), ``estimate``
 #: (depends on the statistic), ``p_value``.
 Region = dict[str, Any]
-TAU_TOLERANCE = 0.99  # ratio of averaging times that are equal but for rounding
+#: Ratios of averaging times that are equal but for rounding.
+MIN_TAU_RATIO, MAX_TAU_RATIO = 0.99, 1.01
+#: On either side of a window, in which the time of its region is sought [lengths of the window].
+_REACH_WINDOWS = 3
 _SEPARATE_KINDS = ("slow", "variance", "drifting")
 # Limits of the table; the rows left out are the least certain.
 MAX_PER_ROW = 8  # mismatches of one statistic and row
@@ -166,7 +169,7 @@ def _find_span(
     first, stop = scores["first"].values, scores["stop"].values
     begin, end = scores["begin"].values, scores["end"].values
     fine = _disjoint_windows(first, stop, np.flatnonzero(np.isfinite(z)))
-    reach = 3 * (stop[window] - first[window])
+    reach = _REACH_WINDOWS * (stop[window] - first[window])
     fine = fine[(stop[fine] > first[window] - reach) & (first[fine] < stop[window] + reach)]
     total = np.concatenate([[0.0], np.cumsum(z[fine])])
     best, low, high = -np.inf, 0, fine.size
@@ -250,7 +253,9 @@ def _find_columns(
     if kinds[column] == "line":
         first, last = max(lower - LEAK_LINES, 0), min(upper + LEAK_LINES + 1, kinds.size)
         return np.array([column]), np.arange(first, last)
-    overlap = (low <= high[grown].max() * 1.01) & (high >= low[grown].min() * 0.99)
+    overlap = (low <= high[grown].max() * MAX_TAU_RATIO) & (
+        high >= low[grown].min() * MIN_TAU_RATIO
+    )
     return region, np.flatnonzero(overlap)
 
 
@@ -300,7 +305,7 @@ def _are_alike(region: Region, other: Region, settings: Settings) -> bool:
         return False
     return bool(
         min(region["tau_max_s"], other["tau_max_s"])
-        >= TAU_TOLERANCE * max(region["tau_min_s"], other["tau_min_s"])
+        >= MIN_TAU_RATIO * max(region["tau_min_s"], other["tau_min_s"])
     )
 
 

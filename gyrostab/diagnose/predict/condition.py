@@ -18,7 +18,8 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.regression.nonnegative import solve_bounded
 
 #: Least fitted power over the expected one. Design choice.
-MIN_POWER_RATIO = 0.2
+MIN_FITTED_POWER_RATIO = 0.2
+SCORING_STEPS = 4  # of Fisher scoring, which fits powers
 
 
 def condition_on(state: State, components: list[Component]) -> State:
@@ -94,7 +95,7 @@ def fit_powers(state: State, axis: str, left_out: Bools | None = None) -> Floats
     sizes = state.recall(partial(_fit_sizes, *inputs), b"powers", *inputs)
     if left_out is not None:
         sizes = np.where(np.append(np.zeros(level_count, np.bool_), left_out), 0.0, sizes)
-    return np.maximum(expected + columns @ sizes, MIN_POWER_RATIO * expected)
+    return np.maximum(expected + columns @ sizes, MIN_FITTED_POWER_RATIO * expected)
 
 
 def drop_changed_tails(
@@ -120,9 +121,6 @@ def drop_changed_tails(
     return out
 
 
-_ROUNDS = 4  # steps of Fisher scoring
-
-
 def _fit_sizes(
     expected: Floats, columns: Floats, prior: Floats, low: Floats, power: Floats, shape: Floats
 ) -> Floats:
@@ -137,7 +135,7 @@ def _fit_sizes(
     columns = columns / size
     good = np.isfinite(power) & np.isfinite(shape)
     fitted, sizes = flat, np.zeros(size.size)
-    for _ in range(_ROUNDS):
+    for _ in range(SCORING_STEPS):
         w = np.where(good, shape / fitted**2, 0.0)
         w = np.where(np.isfinite(w), w, 0.0)
         normal = (columns * w[:, None]).T @ columns + np.diag(prior / size**2)
@@ -145,5 +143,5 @@ def _fit_sizes(
         normal += np.diag(np.where(diagonal > 0.0, 1e-9 * diagonal, 1.0))  # 1 where nothing shows
         right = columns.T @ (w * np.where(good, power - flat, 0.0))
         sizes = solve_bounded(normal, right, low * size)
-        fitted = np.maximum(flat + columns @ sizes, MIN_POWER_RATIO * flat)
+        fitted = np.maximum(flat + columns @ sizes, MIN_FITTED_POWER_RATIO * flat)
     return np.asarray(sizes / size)

@@ -35,9 +35,10 @@ class State:
     #: the variance, and so the weight, of every cell.
     expected_power: Array
     masked: Bools  # (axis, block): blocks whose powers and cross-spectra are left out
-    #: (statistic, row) -> columns in the model with and without a candidate; the row is an axis, or
-    #: the two axes of a pair with a comma between them. Powers that effects add, whose sizes cannot
-    #: be negative, are under "added_power", all others under "power".
+    #: (data, row) -> columns in the model with and without a candidate. The data are "mean",
+    #: "power", "added_power" (powers that effects add, whose sizes cannot be negative), "cross",
+    #: "sub_block", "order", "phase_locked" or "transfer"; the row is an axis, or the two axes of a
+    #: pair with a comma between them. ("line", "all") has the lines that are explained, as masks.
     given: dict[tuple[str, str], list[Array]] = field(default_factory=dict)
     settings: Settings = DEFAULTS
     #: What was computed for the record, in any of its states, by the digest of the inputs.
@@ -47,22 +48,23 @@ class State:
         """Compute something, or recall what the same inputs gave before.
 
         Most of what a search tries again has not changed: an effect on one axis changes nothing on
-        the others, and a line nothing in the means.
+        the others, and a line nothing in the means. Bytes among the inputs name the computation:
+        two computations on the same arrays need different ones.
         """
         key = content_digest(*inputs)
         if key not in self.memory:
             self.memory[key] = compute()
         return cast(Result, self.memory[key])
 
-    def given_to(self, statistic: str, axis: str) -> Array | None:
-        """Return the given columns of a statistic of an axis, (..., column); None without any."""
-        columns = self.given.get((statistic, axis))
+    def given_to(self, data: str, axis: str) -> Array | None:
+        """Return the given columns of such data of an axis, (..., column); None without any."""
+        columns = self.given.get((data, axis))
         return np.stack(columns, axis=-1) if columns else None
 
-    def with_columns(self, statistic: str, row: str, columns: Sequence[Array]) -> State:
+    def with_columns(self, data: str, row: str, columns: Sequence[Array]) -> State:
         """Return the state with more given columns."""
         given = dict(self.given)
-        given[statistic, row] = [*given.get((statistic, row), []), *columns]
+        given[data, row] = [*given.get((data, row), []), *columns]
         return replace(self, given=given)
 
     def power_columns(self, axis: str) -> list[Array]:

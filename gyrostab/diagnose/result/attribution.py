@@ -22,6 +22,8 @@ from gyrostab.diagnose.statistics import STATISTICS, find_statistic
 from gyrostab.diagnose.statistics.sample_counts import find_anomalous_blocks, mask_anomalous_blocks
 
 MAX_SPANS = 6  # more intervals than that are reported as the whole record
+_WHOLE_SHARE = 0.9  # of the blocks, above which an effect acts in the whole record; design choice
+_PAUSES_IN_RECORD = 50  # a pause that fits this often into the record is bridged; design choice
 #: Name, scores and standardised scores of each statistic.
 _Scores = Sequence[tuple[str, xr.Dataset, Floats]]
 
@@ -77,12 +79,12 @@ def join_blocks(is_inside: Bools, begin: Floats, end: Floats) -> list[tuple[floa
     >>> join_blocks(np.array([0, 0, 1, 1, 1, 0, 0, 0, 0, 0], bool), t, t + 1)
     [(2.0, 5.0)]
     """
-    if is_inside.mean() > 0.9:
+    if is_inside.mean() > _WHOLE_SHARE:
         return [(float(begin[0]), float(end[-1]))]
     edges = np.flatnonzero(np.diff(is_inside, prepend=False, append=False)).reshape(-1, 2)
     joined: list[list[int]] = []
     for first, stop in edges.tolist():
-        if joined and first - joined[-1][1] <= max(1, is_inside.size // 50):
+        if joined and first - joined[-1][1] <= max(1, is_inside.size // _PAUSES_IN_RECORD):
             joined[-1][1] = stop
         else:
             joined.append([first, stop])

@@ -139,7 +139,7 @@ class Statistic:
 
     # ---------------------------------------------------------------------- candidates
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield what an effect does to the statistic; by default nothing."""
         yield from ()
 
@@ -153,7 +153,7 @@ class Statistic:
     ) -> list[Candidate]:
         """Return the candidates of an effect that follows these channels."""
         variants = distinct_variants(
-            [variant for case in prospects for variant in self.design(case)]
+            [variant for prospect in prospects for variant in self.design(prospect)]
         )
         if not variants:
             return []
@@ -190,12 +190,9 @@ class Statistic:
         rows = self.rows(group[0], trial.state)
         if not rows:  # pairs of a single axis
             return []
-        factors = []
-        spread = 1
-        for row in range(len(rows)):
-            factors.append(self.row_factors(group, row, trial)[:, 1:])
-            spread = factors[-1].shape[1] // sum(len(candidate.variants) for candidate in group)
-        return collect_evidence(group, rows, factors, spread)
+        factors = [self.row_factors(group, row, trial)[:, 1:] for row in range(len(rows))]
+        variant_count = sum(len(candidate.variants) for candidate in group)
+        return collect_evidence(group, rows, factors, factors[-1].shape[1] // variant_count)
 
     def row_factors(self, group: Sequence[Candidate], row: int, trial: Trial) -> Array:
         """Return the factors of all variants in one row, as `linear_model_factors` does."""

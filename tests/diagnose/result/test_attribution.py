@@ -12,7 +12,7 @@ from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.locate.mismatches import locate_mismatches, merge_regions
 from gyrostab.diagnose.nulls.scores import null_scores
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
-from gyrostab.diagnose.predict.condition import MIN_POWER_RATIO, condition_on, fit_powers
+from gyrostab.diagnose.predict.condition import MIN_FITTED_POWER_RATIO, condition_on, fit_powers
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.result.attribution import (
     active_blocks,
@@ -306,7 +306,9 @@ def test_leaving_out_power_that_was_fitted_below_zero_adds_none(shaken):
     state = replace(state, blocks=state.blocks.assign(power=power))
     state = state.with_columns("power", "x", [level * part])
     whole, without = fit_powers(state, "x"), fit_powers(state, "x", np.array([True]))
-    np.testing.assert_allclose(whole[18:20], MIN_POWER_RATIO * state.expected_power[0, 18:20])
+    np.testing.assert_allclose(
+        whole[18:20], MIN_FITTED_POWER_RATIO * state.expected_power[0, 18:20]
+    )
     np.testing.assert_allclose(without[:20] / without[20:40], 1.0, atol=0.2)
 
 
