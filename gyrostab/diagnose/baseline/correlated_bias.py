@@ -155,7 +155,7 @@ class _AxisRecord:
         """Find the largest likelihood from several starts; the best first."""
         return find_peaks(self.negative_likelihood, starts, self.ends[: starts[0].size])
 
-    def measure_evidence(self, peak: OptimizeResult) -> tuple[float, Floats]:
+    def integrate_likelihood(self, peak: OptimizeResult) -> tuple[float, Floats]:
         """Return the evidence by Laplace's approximation, and the covariance of the parameters."""
         count = peak.x.size
         precision = _measure_curvature(self.negative_likelihood, peak.x)
@@ -201,10 +201,10 @@ def find_correlated_bias(state: State, axis: str) -> CorrelatedBias | None:
     without, with_bias = (
         record.find_peaks([peak.x for peak in peaks]) for peaks in (without, with_bias)
     )
-    evidence, covariance = record.measure_evidence(with_bias[0])
+    evidence, covariance = record.integrate_likelihood(with_bias[0])
     to_rms = np.array([[1.0, -0.5], [0.0, 1.0]])
     return CorrelatedBias(
-        evidence - record.measure_evidence(without[0])[0],
+        evidence - record.integrate_likelihood(without[0])[0],
         *_rms_and_time(with_bias[0]),
         to_rms @ covariance[-2:, -2:] @ to_rms.T,
     )

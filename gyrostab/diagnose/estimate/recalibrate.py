@@ -215,15 +215,11 @@ def _collect_effects(
                 out.known += known
                 out.free += [np.broadcast_to(column, shape) for column in free]
                 out.means += means
-        numbers = next(
-            (
-                effect_fit
-                for effect_fit in fitted
-                if effect_fit.identification is identification and axis in effect_fit.axes
-            ),
+        effect_fit = next(
+            (fit for fit in fitted if fit.identification is identification and axis in fit.axes),
             None,
         )
-        if numbers is None or numbers.effect is None:
+        if effect_fit is None or effect_fit.effect is None:
             continue
         # power in a statistic of powers has a free size
         is_in_power = any(component.statistic.is_power for component in components)
@@ -231,15 +227,15 @@ def _collect_effects(
             component.statistic.has_power_of_effect(component, identifications.state)
             for component in components
         ):
-            out.known += _effect_power(numbers.effect, blocks, axis)
+            out.known += _effect_power(effect_fit.effect, blocks, axis)
             errors = [
                 2.0 * estimate.stderr / abs(estimate.value)
-                for estimate in numbers.parameters.values()
+                for estimate in effect_fit.parameters.values()
                 if estimate.value
             ]
             out.doubt = max([out.doubt, *errors])
         if any(component.is_filter for component in components):
-            out.response = out.response * band_response(numbers.effect, blocks)
+            out.response = out.response * band_response(effect_fit.effect, blocks)
     return out if touched else None
 
 

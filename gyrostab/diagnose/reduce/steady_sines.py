@@ -162,8 +162,8 @@ class SineSearch:
         order = np.lexsort((total, place))
         last = np.append(np.flatnonzero(np.diff(place[order])), order.size - 1)
         chosen = order[last]
-        gains = factor[:, chosen] - math.log(2.0)
-        sharing = np.maximum((gains > 0.0).sum(axis=0), 1)
+        axis_nats = factor[:, chosen] - math.log(2.0)
+        sharing = np.maximum((axis_nats > 0.0).sum(axis=0), 1)
         leak = np.arange(-_FINER * LEAK_LINES, _FINER * LEAK_LINES + 1)
         neighbours = np.clip(chosen[:, None] + leak, 0, frequency.size - 1)
         # (axis, line, neighbour)
@@ -178,7 +178,7 @@ class SineSearch:
         total_weight = np.maximum(weights.sum(axis=-1), 1e-300)
         centre = (weights * frequency[neighbours]).sum(axis=-1) / total_weight
         arrays = {
-            "sine_nats": gains - cost / sharing,
+            "sine_nats": axis_nats - cost / sharing,
             "sine_frequency": centre,
             "sine_resolution": np.full(chosen.size, _FINER * step),
             "sine_square": scale * above.sum(axis=-1),

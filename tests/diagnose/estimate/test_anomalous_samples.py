@@ -450,7 +450,7 @@ def test_spikes_in_most_blocks_keep_their_size_and_power():
         ([], [fitted]),
     ):  # effects of the recording alone, or of the simulation too
         surfaces = conclude._make_surfaces_with_outliers(
-            blocks, conclude.Fit(identifications, clean, lacking, known), clean, clean
+            blocks, conclude.FinalFit(identifications, clean, lacking, known), clean, clean
         )
         short = surfaces["avar"].isel(tau=0).mean(["axis", "window"])
         before, after = (

@@ -87,7 +87,7 @@ def test_diagnosis_separates_noise_and_effects(shaken):
     assert noise_coefficient(fit.noise, "N")[0] == noise_coefficient(after, "N")[0] < 1.2 * 0.003
     (size,) = fit.fitted[0].parameters.values()
     assert size.low < 0.002 < size.high
-    held = conclude.measure_evidence(identifications.state.blocks, baseline, identifications, first)
+    held = conclude.measure_held_out(identifications.state.blocks, baseline, identifications, first)
     assert held["misfit_after"] == pytest.approx(1.0, abs=0.15)
 
 

@@ -283,7 +283,7 @@ def test_only_lasting_effects_are_forecast(points: list[list[float]], has_foreca
     identifications = identify_by_hand(
         blocks, baseline, "vibration_noise", "power", ("white",), exponent=1.0
     )
-    held = conclude.measure_evidence(
+    held = conclude.measure_held_out(
         blocks, baseline, identifications, fit_identifications(identifications, baseline)
     )
     assert math.isfinite(held["forecast_gain"]) == has_forecast
@@ -324,7 +324,7 @@ def test_noise_that_is_over_does_not_spoil_the_forecast_of_another_effect():
         identified=(*vibration.identified, *warmth.identified),
         state=condition_on(vibration.state, list(warmth.identified[0].components)),
     )
-    held = conclude.measure_evidence(blocks, baseline, both, fit_identifications(both, baseline))
+    held = conclude.measure_held_out(blocks, baseline, both, fit_identifications(both, baseline))
     assert held["forecast_gain"] > 0.0
 
 

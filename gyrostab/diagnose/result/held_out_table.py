@@ -40,11 +40,11 @@ FORECAST_FROM_SHARE = 0.7  # share of the record that a forecast begins from
 SHORT_WINDOW_BLOCKS = 5  # length of the middle one of the three windows of the Allan variance
 
 
-def measure_evidence(
+def measure_held_out(
     blocks: xr.Dataset,
     baseline: xr.Dataset,
     identifications: Identifications,
-    first: Sequence[Fitted],
+    first_fit: Sequence[Fitted],
 ) -> dict[str, float]:
     """Measure what the effects gain on held-out data, with the noise fitted together with them.
 
@@ -52,9 +52,9 @@ def measure_evidence(
     random biases and phase-locked components are in none of these: their evidence is added.
     """
     with_course, random_nats = _remove_random_biases(identifications)
-    first = [
+    first_fit = [
         fitted
-        for fitted in first
+        for fitted in first_fit
         if not any(component.statistic.is_random_bias for component in fitted.components)
     ]
     judged, phase_locked_nats = remove_phase_locked(with_course, blocks)
@@ -85,7 +85,7 @@ def measure_evidence(
     def train(
         chosen: Identifications, known: Bools, is_left_out: Sequence[bool] = ()
     ) -> xr.Dataset:
-        noise = recalibrate(chosen, calibrate(known), first, known)
+        noise = recalibrate(chosen, calibrate(known), first_fit, known)
         renewed = with_noise(chosen, noise)
         left_out = tuple(compress(renewed.identified, is_left_out))
         return predict_baseline(renewed, noise, known, left_out=left_out)
@@ -105,7 +105,7 @@ def measure_evidence(
         clean,
         before,
         after,
-        more_gain=count_nats + random_nats + phase_locked_nats,
+        added_nats=count_nats + random_nats + phase_locked_nats,
         shown=with_phase_locked if phase_locked_nats else after,
         forecast=partial(train, replace(judged, identified=begun), is_left_out=is_over)
         if has_forecast
@@ -178,7 +178,7 @@ def held_out(
     before: FitBaseline,
     after: FitBaseline,
     *,
-    more_gain: float,
+    added_nats: float,
     shown: FitBaseline,
     forecast: FitBaseline,
 ) -> dict[str, float]:
@@ -186,7 +186,7 @@ def held_out(
 
     The record is cut into stretches. Every fourth is held out in turn, and the models are fitted to
     the rest. Models that differ in their means are also compared on stretches of all lengths of
-    `gyrostab.diagnose.evidence.folds`, as in the identification; the length with the largest gain
+    `gyrostab.diagnose.evidence.folds`, as in the identification; the length with the most evidence
     counts. Over a short gap, a random walk follows a slow drift from both sides, so that a model of
     the drift gains little there.
 
@@ -196,12 +196,12 @@ def held_out(
         Take the mask of the blocks that they may use, and return the baseline fitted to them, the
         second with the effects in its ``spectrum``, ``known_mean`` and, for noise in common,
         ``cross`` (pair, block, band).
-    more_gain : float
+    added_nats : float
         Held-out gain [nats] of what is in neither means nor powers nor cross-spectra, to be added:
         sample counts, phase-locked components, random biases. Lines whose phase wanders are in the
         powers of their bands already and would count twice.
     shown : callable
-        The same with all effects, those of `more_gain` included, for the Allan variance.
+        The same with all effects, those of `added_nats` included, for the Allan variance.
     forecast : callable
         The same with the effects that can be forecast.
 
@@ -217,17 +217,19 @@ def held_out(
     windows = cut_stretches(blocks)
     fold_of_window = np.arange(windows.first.size) % FOLDS
     stretches = np.repeat(fold_of_window, windows.length)
-    gains: list[Floats] = []
+    nats_by_length: list[Floats] = []
     moves = False
     squares: dict[str, list[Floats]] = {"before": [], "after": []}
     for fold in (stretches, *fold_blocks(blocks).values[1:]):
-        gain = np.array([more_gain, 2.0 * abs(more_gain)])
+        length_nats = np.array([added_nats, 2.0 * abs(added_nats)])
         for number in range(FOLDS):
             held = fold == number
             models = {"before": before(~held), "after": after(~held)}
-            gain = gain + _compare_models(blocks, models["before"], models["after"], held)
+            length_nats = length_nats + _compare_models(
+                blocks, models["before"], models["after"], held
+            )
             moves |= not models["after"]["known_mean"].equals(models["before"]["known_mean"])
-            if gains:
+            if nats_by_length:
                 continue  # the Allan variance is compared on the stretches
             if shown is not after:
                 models["after"] = shown(~held)
@@ -235,10 +237,10 @@ def held_out(
             inside = Windows(windows.first[chosen], windows.stop[chosen])
             for name, baseline in models.items():
                 squares[name].append(_allan_scores(blocks, baseline, inside))
-        gains.append(gain)
+        nats_by_length.append(length_nats)
         if not moves:
             break
-    evidence_nats, variance = max(gain.tolist() for gain in gains)
+    evidence_nats, variance = max(length_nats.tolist() for length_nats in nats_by_length)
     known = select_forecast_start(blocks)
     late, early = (
         log_likelihood(blocks, model(known), known, ~known) for model in (forecast, before)
