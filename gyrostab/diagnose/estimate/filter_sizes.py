@@ -11,6 +11,7 @@ from scipy.optimize import minimize_scalar
 from gyrostab.arrays import Floats
 from gyrostab.diagnose.baseline.expected_statistics import band_columns, reduced_shape
 from gyrostab.diagnose.baseline.posterior import Fit, average_blocks, choose_filter, fit_behind
+from gyrostab.diagnose.predict.average_sizes import Size
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, band_widths, stack_columns, unspread_share
@@ -28,7 +29,7 @@ MIN_ELSEWHERE_SHARE = 0.02  # of the probability, from which on other places wid
 
 def fit_filter_sizes(
     components: Sequence[Component], state: State
-) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
+) -> tuple[dict[str, Size], dict[str, float]]:
     """Fit the cutoff or length of a filter to the powers of all its axes, with free noise.
 
     The parameter that is measured has its standard error, and the ends of its 95 % interval where

@@ -13,7 +13,7 @@ from gyrostab.arrays import Array
 from gyrostab.diagnose.evidence.held_out import LinearModel, linear_model_factors
 from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.predict.average_sizes import average_sizes
+from gyrostab.diagnose.predict.average_sizes import Size, average_sizes
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
     CandidateEvidence,
@@ -29,7 +29,8 @@ from gyrostab.diagnose.settings import Settings
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Windows
 
-Sizes = Mapping[str, tuple[float, ...]]
+#: Keys are ``name``, or ``name.axis`` for a size of each of several axes.
+Sizes = Mapping[str, Size]
 Region = Mapping[str, Any]
 
 
@@ -267,30 +268,27 @@ class Statistic:
         return linear_mixture(component, state, variant)
 
     def estimate(self, fit: SizeFit) -> Sizes:
-        """Estimate parameters with their standard errors; by axis if there are several.
-
-        Keys are ``name`` or ``name.axis``; an asymmetric 95 % interval has its ends behind.
-        """
-        out: dict[str, tuple[float, ...]] = {}
+        """Estimate parameters with their standard errors; by axis if there are several."""
+        out: dict[str, Size] = {}
         points: list[dict[str, float | str]] = []
         # of a parameter that the axes share, the value on the strongest comes last and stays
         for component in sorted(fit.components, key=lambda component: component.evidence_nats):
             if component.variant.columns[:1] == ("any",):
                 continue
-            mean, covariance, ends, nuisance, (best, variant) = average_sizes(
-                component, fit.state, fit.candidates
-            )
+            averaged = average_sizes(component, fit.state, fit.candidates)
             for number, name in enumerate(component.variant.columns):
-                value, sd = float(mean[number]), float(np.sqrt(covariance[number, number]))
-                size: tuple[float, ...] = (value, sd, *ends[:, number].tolist())
-                likeliest = float(best[number])
+                value = float(averaged.mean[number])
+                sd = float(np.sqrt(averaged.covariance[number, number]))
+                ends = averaged.ends[:, number]
+                size: Size = (value, sd, *ends.tolist())
+                likeliest = float(averaged.likeliest_sizes[number])
                 if component.variant.squared:
-                    size = (*_square_root(value, sd), *np.sqrt(np.maximum(ends[:, number], 0.0)))
+                    size = (*_square_root(value, sd), *np.sqrt(np.maximum(ends, 0.0)))
                     likeliest = float(np.sqrt(max(likeliest, 0.0)))
                 key = name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"
                 out[key], fit.likeliest[key] = size, likeliest
-            out |= nuisance
-            points.append(dict(variant.values))
+            out |= averaged.nuisance
+            points.append(dict(averaged.likeliest_variant.values))
         if all(point == points[0] for point in points):
             fit.likeliest.update(points[0] if points else {})
         else:  # axes that differ in a common parameter

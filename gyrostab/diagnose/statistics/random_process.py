@@ -16,7 +16,7 @@ from gyrostab.diagnose.baseline.posterior import visible_coefficients
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.held_out import Tier, mean_factors, mean_residual
 from gyrostab.diagnose.evidence.wandering import expected_processes, with_process
-from gyrostab.diagnose.predict.average_sizes import plain_places
+from gyrostab.diagnose.predict.average_sizes import Size, plain_places
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
     CandidateEvidence,
@@ -112,7 +112,7 @@ class RandomProcess(BlockMeanStatistic):
 
     def estimate(self, fit: SizeFit) -> Sizes:
         """Estimate the size of a random walk that follows a channel, for its best exponent."""
-        out: dict[str, tuple[float, ...]] = {}
+        out: dict[str, Size] = {}
         for component in fit.components:
             (name,) = component.variant.columns
             key = name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"

@@ -12,6 +12,7 @@ import xarray as xr
 from gyrostab.arrays import Array, Bools
 from gyrostab.diagnose.evidence.held_out import LinearModel
 from gyrostab.diagnose.evidence.spectral_lines import interpolate_bands
+from gyrostab.diagnose.predict.average_sizes import Size
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
 from gyrostab.diagnose.predict.condition import free_covariance
 from gyrostab.diagnose.predict.linear_model import (
@@ -166,7 +167,7 @@ class RotationOrder(Statistic):
         For the earth rate these are latitude and toolface of a tool that points down. Angles get
         the error of the form of the amplitude: a share of an angle has no meaning.
         """
-        out: dict[str, tuple[float, ...]] = {}
+        out: dict[str, Size] = {}
         for component in fit.components:
             size, sd, angle = fit_amplitude(component, fit.state)
             error = math.hypot(sd / max(size, 1e-300), fit.state.settings.size_error_share)

@@ -12,6 +12,7 @@ from scipy.special import gammaincinv, ndtr, ndtri
 
 from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
+from gyrostab.diagnose.predict.average_sizes import Size
 from gyrostab.diagnose.reduce.outliers import outlier_limit
 from gyrostab.diagnose.reduce.schema import axis_values, weighted_mean
 from gyrostab.diagnose.settings import INTERVAL_TAILS, Settings
@@ -34,7 +35,7 @@ def estimate_from_counts(
     blocks: xr.Dataset,
     count_evidence: CountEvidence,
     settings: Settings,
-) -> dict[str, tuple[float, ...]]:
+) -> dict[str, Size]:
     """Estimate the parameters of an effect on the sample distribution."""
     on_axis = blocks.sel(axis=axis)
     samples = max(float(on_axis["samples"].sum()), 1.0)
@@ -163,7 +164,7 @@ def _size_range(blocks: xr.Dataset, spread: float, samples: float) -> tuple[floa
 
 def _size_spikes(
     count: float, hours: float, outliers: tuple[float, float, float] | None, settings: Settings
-) -> dict[str, tuple[float, ...]]:
+) -> dict[str, Size]:
     """Return how often outliers occur, and their size, with intervals of positive quantities.
 
     The number is that of the outliers seen, over the share of a normal law that is seen. Their true

@@ -17,6 +17,7 @@ from gyrostab.diagnose.baseline.expected_statistics import sum_noise
 from gyrostab.diagnose.evidence.held_out import mean_residual
 from gyrostab.diagnose.evidence.products import axis_noise
 from gyrostab.diagnose.evidence.wandering import expected_processes, with_process
+from gyrostab.diagnose.predict.average_sizes import Size
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
     CandidateEvidence,
@@ -111,7 +112,7 @@ class WanderingBias(RandomProcess):
 
     def estimate(self, fit: SizeFit) -> Sizes:
         """Estimate the rms of every axis, and the correlation time that they have in common."""
-        out: dict[str, tuple[float, ...]] = {}
+        out: dict[str, Size] = {}
         times = []
         for component in fit.components:
             (name,), axis = component.variant.columns, component.row[0]
