@@ -337,7 +337,7 @@ def test_line_explains_only_its_own_frequency():
         Variant({}, ("amplitude",), np.empty(0)),
         ("x",),
         50.0,
-        place=116,
+        line_index=116,
     )
     blocks = xr.Dataset(coords={"line_frequency": ("line", np.arange(1, 400) * 0.25)})
     region = {

@@ -293,7 +293,9 @@ def _model_settings(
     """Return settings that the model needs in addition to the sizes."""
     if identification.effect == "spectral_line" and component.statistic.is_line:
         return {
-            "quality": line_quality(state.blocks, state.baseline, component.row[0], component.place)
+            "quality": line_quality(
+                state.blocks, state.baseline, component.row[0], component.line_index
+            )
         }
     if identification.effect == "feedback_reset" and "ramp_turns" in state.blocks:
         return {"phase": "channel"}
@@ -377,9 +379,13 @@ def _split_harmonics(identification: Selection, state: State) -> list[list[Compo
         if component.statistic.is_rotation and component.candidate.is_per_axis
     ]
     sets = harmonic_sets(state.blocks.sizes["harmonic"]) if turning else []
-    harmonics = sorted({k for component in turning for k in sets[component.place]})
+    harmonics = sorted({k for component in turning for k in sets[component.line_index]})
     by_harmonic = [
-        [replace(component, place=k) for component in turning if k in sets[component.place]]
+        [
+            replace(component, line_index=k)
+            for component in turning
+            if k in sets[component.line_index]
+        ]
         for k in harmonics
     ]
     if len(by_harmonic) < 2:

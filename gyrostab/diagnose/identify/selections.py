@@ -133,7 +133,7 @@ def reduce_selection(
 
 def _is_same_effect(first: Selection, other: Selection) -> bool:
     lines = {
-        component.place
+        component.line_index
         for component in components_of((first, other))
         if component.statistic.is_line
     }

@@ -102,7 +102,7 @@ def _finish_identification(
         and sum_evidence(keep_physical(components, state)[0]) >= min_nats
     ]
     lines = {
-        component.place
+        component.line_index
         for component in components_of(chosen)
         if component.candidate.effect == PLAIN_LINE
     }

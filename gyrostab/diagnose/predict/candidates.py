@@ -144,7 +144,7 @@ class Component:
     variant: Variant
     row: tuple[str, ...]  # axes of the row
     evidence_nats: float  # held-out evidence [nats]
-    place: int = -1  # index of the line, or of the set of harmonics; -1 if there is none
+    line_index: int = -1  # of the line, or of the set of harmonics; -1 if there is none
     note: str = ""  # sentence about terms that the record does not separate
     close: tuple[Variant, ...] = ()  # variants that explain the row about as well, the best first
 
@@ -177,8 +177,8 @@ class CandidateEvidence:
     rows: list[tuple[str, ...]]  # axes of each row
     evidence_nats: Array  # (record, row): held-out evidence [nats]
     best: tuple[Variant, ...]  # best variant of each row for the first record
-    #: (record, row): index of the line for lines; otherwise empty.
-    place: Ints = field(default_factory=lambda: np.empty((0, 0), np.int64))
+    #: (record, row): index of the line, or of the set of harmonics; otherwise empty.
+    line_index: Ints = field(default_factory=lambda: np.empty((0, 0), np.int64))
     #: (variant, row): log Bayes factors on the first record with their prior, or empty [nats].
     variant_nats: Array = field(default_factory=lambda: np.empty((0, 0)))
 

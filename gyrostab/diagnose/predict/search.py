@@ -125,7 +125,7 @@ def collect_evidence(
         best = tuple(variants[number][at] for at in place.tolist())
         evidence = CandidateEvidence(candidate, rows, evidence_nats[number], best)
         out.append(
-            replace(evidence, place=place[None])
+            replace(evidence, line_index=place[None])
             if designs_per_variant > 1
             else replace(evidence, variant_nats=variant_nats)
         )

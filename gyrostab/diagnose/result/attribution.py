@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache, partial
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -28,6 +29,14 @@ _PAUSES_IN_RECORD = 50  # a pause that fits this often into the record is bridge
 _Scores = Sequence[tuple[str, xr.Dataset, Floats]]
 
 
+class _TimedEffect(NamedTuple):
+    """An identified effect, and when it acts [s]."""
+
+    identification: Selection
+    active_spans: list[tuple[float, float]]
+    moving_spans: list[tuple[float, float]]  # in which it moves the rate within blocks
+
+
 def active_blocks(
     identification: Selection, blocks: xr.Dataset, *, settings: Settings = DEFAULTS
 ) -> Bools:
@@ -45,7 +54,7 @@ def active_blocks(
             continue
         if not component.statistic.has_course or design.size == 0:
             return np.ones(block_count, bool)
-        place = [number for number, size in enumerate(design.shape) if size == block_count]
+        place = [axis for axis, length in enumerate(design.shape) if length == block_count]
         if not place:
             return np.ones(block_count, bool)
         size = np.asarray(np.moveaxis(np.asarray(design), place[0], 0).reshape(block_count, -1))
@@ -102,7 +111,7 @@ def attribute_mismatches(
     *,
     level: float,
     without: Callable[[Sequence[Selection]], xr.Dataset] | None = None,
-    still: xr.Dataset | None = None,
+    lines_at_rest: xr.Dataset | None = None,
 ) -> list[list[str]]:
     """Find the effects that explain each mismatch.
 
@@ -114,8 +123,9 @@ def attribute_mismatches(
     power and the lowest lines exceed the noise; the effect explains these too.
 
     `after` is the baseline with the effects, and `without` returns that except for those given, at
-    the sizes of the joint fit. Without it, every effect at the place of a mismatch explains it.
-    `still` has line spectra without the blocks in which an effect moves the rate.
+    the sizes of the joint fit. Without it, whether an effect is needed is not tested: every effect
+    at the place of a mismatch explains it. `lines_at_rest` has line spectra without the blocks in
+    which an effect moves the rate.
     """
     settings = null.settings
 
@@ -123,54 +133,37 @@ def attribute_mismatches(
     def scores_without(out: tuple[Selection, ...]) -> _Scores:
         remaining = [identification for identification in identified if identification not in out]
         baseline = without(out) if without is not None and out else after
-        return _statistic_scores(blocks, baseline, null, located, remaining, still=still)
+        return _statistic_scores(
+            blocks, baseline, null, located, remaining, lines_at_rest=lines_at_rest
+        )
 
     def score_without(region: Region, out: Sequence[Selection]) -> tuple[float, float]:
         return _score_left(region, scores_without(tuple(out)), null, level)
 
-    when = [_explained_spans(identification, blocks, settings) for identification in identified]
-    moves = [
-        _moving_spans(identification, blocks, after, settings) for identification in identified
+    timed_effects = [
+        _TimedEffect(
+            identification,
+            _explained_spans(identification, blocks, settings),
+            _moving_spans(identification, blocks, after, settings),
+        )
+        for identification in identified
     ]
     explained = []
     for region in located:
         score, limit = score_without(region, ())
-        axes = set(str(region["axes"]).split())
         shown = []
-        for identification, its_time, its_moves in zip(identified, when, moves, strict=True):
-            moved = _is_within_blocks(region, blocks) and any(
-                _overlap_seconds(region, span) > 0.0 for span in its_moves
+        for effect in timed_effects:
+            without_it = partial(score_without, region, (effect.identification,))
+            components = _components_at(
+                region,
+                effect,
+                blocks,
+                settings,
+                is_left=score >= limit,
+                score_without=None if without is None else without_it,
             )
-            components = [
-                component
-                for component in identification.components
-                if component.statistic.can_explain(component, region, blocks, settings)
-                and (moved or not component.statistic.is_in_means or region["view"] != "spectrum")
-            ]
-            common = axes & set(identification.axes)
-            if not components or not common:
-                continue
-            together = str(region["what"]) == "slow" and len(common) > 1
-            if score >= limit and all(
-                component.statistic.is_modelled_in(region, together=together)
-                for component in components
-            ):
-                continue
-            if (
-                moved
-                or any(
-                    _overlap_seconds(region, (begin, end))
-                    >= settings.overlap_share * min(region["end"] - region["begin"], end - begin)
-                    for begin, end in its_time
-                )
-                or (
-                    without is not None
-                    and _is_caused_elsewhere(
-                        region, components, partial(score_without, region, (identification,))
-                    )
-                )
-            ):
-                shown.append((identification, components))
+            if components:
+                shown.append((effect.identification, components))
         is_gone = without is not None and score < limit
         needed = (
             needed_effects(region, shown, partial(score_without, region), settings=settings)
@@ -179,6 +172,49 @@ def attribute_mismatches(
         )
         explained.append(list(dict.fromkeys(identification.effect for identification in needed)))
     return explained
+
+
+def _components_at(
+    region: Region,
+    effect: _TimedEffect,
+    blocks: xr.Dataset,
+    settings: Settings,
+    *,
+    is_left: bool,
+    score_without: Callable[[], tuple[float, float]] | None,
+) -> list[Component]:
+    """Return the components of an effect that may explain a mismatch; empty if it cannot.
+
+    `is_left` says whether the mismatch is left with all effects in the baseline, `score_without`
+    returns its score and limit without this one.
+    """
+    has_moved = _is_within_blocks(region, blocks) and any(
+        _overlap_seconds(region, span) > 0.0 for span in effect.moving_spans
+    )
+    components = [
+        component
+        for component in effect.identification.components
+        if component.statistic.can_explain(component, region, blocks, settings)
+        and (has_moved or not component.statistic.is_in_means or region["view"] != "spectrum")
+    ]
+    common = set(str(region["axes"]).split()) & set(effect.identification.axes)
+    if not components or not common:
+        return []
+    together = str(region["what"]) == "slow" and len(common) > 1
+    if is_left and all(
+        component.statistic.is_modelled_in(region, together=together) for component in components
+    ):
+        return []
+    is_at_its_time = has_moved or any(
+        _overlap_seconds(region, (begin, end))
+        >= settings.overlap_share * min(region["end"] - region["begin"], end - begin)
+        for begin, end in effect.active_spans
+    )
+    if is_at_its_time or (
+        score_without is not None and _is_caused_elsewhere(region, components, score_without)
+    ):
+        return components
+    return []
 
 
 def drop_expected(
@@ -291,13 +327,13 @@ def _statistic_scores(
     regions: Sequence[Region],
     identified: Sequence[Selection],
     *,
-    still: xr.Dataset | None = None,
+    lines_at_rest: xr.Dataset | None = None,
 ) -> _Scores:
     """Score the recording against a baseline with effects.
 
     Statistics of whole blocks leave out those with anomalous samples of `identified`, and
     statistics of their inside those in which an effect moves the rate. The line statistics use the
-    lines of `still`, by default those of `blocks`.
+    lines of `lines_at_rest`, by default those of `blocks`.
     """
     out = []
     settings = null.settings
@@ -306,8 +342,8 @@ def _statistic_scores(
     masked = mask_anomalous_blocks(blocks, components_of(identified), settings)
     turns_left_out = drop_changed_tails(blocks, after["spectrum"].values, settings)
     lines = masked
-    if still is not None:
-        lines = masked.assign({name: still[name] for name in ("line_power", "line_weight")})
+    if lines_at_rest is not None:
+        lines = masked.assign({name: lines_at_rest[name] for name in ("line_power", "line_weight")})
     for statistic in STATISTICS:
         if statistic.name not in null.statistics:
             continue
@@ -333,9 +369,9 @@ def _with_shared_lines(
     because it shows what the block means have in common.
     """
     lines = [
-        (component.place, component.row[0])
+        (component.line_index, component.row[0])
         for component in components_of(identified)
-        if component.statistic.is_line and component.place >= 0
+        if component.statistic.is_line and component.line_index >= 0
     ]
     if len(lines) < 2:
         return after

@@ -174,7 +174,7 @@ def _attributed_mismatches(
         null,
         level=task.level / 2.0,
         without=without,
-        still=lines,
+        lines_at_rest=lines,
     )
     return mismatch_tables(located, explained, fit.identifications, blocks)
 

@@ -137,7 +137,7 @@ class RotationOrder(Statistic):
         """
         count = state.blocks.sizes["harmonic"]
         if component.candidate.is_per_axis:
-            chosen = harmonic_sets(count)[component.place]
+            chosen = harmonic_sets(count)[component.line_index]
             patterns = [(axis, np.ones(count, np.complex128)) for axis in component.row]
         else:
             chosen, pattern = (0,), component.variant.design[0]
@@ -180,7 +180,7 @@ class RotationOrder(Statistic):
             label = "" if len(fit.axes) == 1 else f".{component.row[0]}"
             out |= {f"amplitude{label}": (size, sd), f"phase{label}": (angle, math.degrees(error))}
             harmonics = fit.state.blocks["harmonic"].values
-            out["order"] = (float(harmonics[component.place % harmonics.size]), 0.0)
+            out["order"] = (float(harmonics[component.line_index % harmonics.size]), 0.0)
         return out
 
 
@@ -189,7 +189,7 @@ def is_reversed(component: Component) -> bool:
     return (
         component.statistic.is_rotation
         and not component.candidate.is_per_axis
-        and component.place % 2 == 1
+        and component.line_index % 2 == 1
     )
 
 

@@ -138,7 +138,7 @@ class SpectralLine(Statistic):
         ]
 
     def condition(self, state: State, component: Component) -> State:
-        frequency = float(state.blocks["line_frequency"].values[component.place])
+        frequency = float(state.blocks["line_frequency"].values[component.line_index])
         axis = component.row[0]
         power_columns = state.power_columns(axis)
         for band in find_bands(state.blocks, frequency):
@@ -148,7 +148,7 @@ class SpectralLine(Statistic):
                 continue  # another line in the same band is already given
             state = state.with_columns("power", axis, [column])
             state = free_covariance(state, (axis,), column)
-        skirt = line_skirt(state.blocks, axis, component.place, state.settings)
+        skirt = line_skirt(state.blocks, axis, component.line_index, state.settings)
         return state.with_columns("line", "all", [skirt])
 
     def noise_shares(
@@ -158,7 +158,7 @@ class SpectralLine(Statistic):
 
         The power of the bands of a resonance is free: its slopes are not known.
         """
-        blocks, place = state.blocks, component.place
+        blocks, place = state.blocks, component.line_index
         if place < 0 or math.isfinite(line_quality(blocks, state.baseline, axis, place)):
             return super().noise_shares(component, axis, state, expected_power)
         total, _ = mean_line_power(blocks, axis)
@@ -175,7 +175,7 @@ class SpectralLine(Statistic):
 
         The powers of bands show little of it, and slow noise is fitted to that of a slow one.
         """
-        axis_blocks, place = blocks.sel(axis=component.row[0]), component.place
+        axis_blocks, place = blocks.sel(axis=component.row[0]), component.line_index
         return place >= 0 and _has_constant_phase(axis_blocks, place)
 
     def estimate(self, fit: SizeFit) -> Sizes:
@@ -191,7 +191,7 @@ class SpectralLine(Statistic):
         # the strongest of several lines of an axis is last
         for component in sorted(fit.components, key=lambda component: component.evidence_nats):
             amplitude, frequency = estimate_line(
-                blocks, component.row[0], component.place, fit.state.settings
+                blocks, component.row[0], component.line_index, fit.state.settings
             )
             response = np.sinc(frequency[0] / float(blocks.attrs["sampling_rate_hz"]))
             if is_sway:
@@ -209,10 +209,10 @@ class SpectralLine(Statistic):
             return False
         if region["view"] == "cross_axis":
             return str(region["what"]) != "slow"
-        if component.place < 0 or region["view"] == "distribution":
+        if component.line_index < 0 or region["view"] == "distribution":
             return True
         lines = blocks["line_frequency"].values
-        mine = float(lines[component.place])
+        mine = float(lines[component.line_index])
         if np.isfinite(region["frequency"]):
             return bool(
                 abs(region["frequency"] - mine)
@@ -231,9 +231,9 @@ class SpectralLine(Statistic):
 
     def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
         """Return the averaging time at which the Allan variance of the line is largest."""
-        if component.place < 0:
+        if component.line_index < 0:
             return super().averaging_times(component, blocks)
-        tau = SINE_TAU_CYCLES / float(blocks["line_frequency"].values[component.place])
+        tau = SINE_TAU_CYCLES / float(blocks["line_frequency"].values[component.line_index])
         return tau, tau
 
     def describe(self, region: Region, when: str) -> str:

@@ -273,7 +273,7 @@ def test_line_has_its_frequency_to_one_bin_and_the_amplitude_of_the_rate():
         blocks, baseline, "spectral_line", "spectral_line", ("amplitude",)
     )
     place = int(blocks["line_power"].sel(axis="x").mean("part").values.argmax())
-    component = replace(identifications.identified[0].components[0], place=place)
+    component = replace(identifications.identified[0].components[0], line_index=place)
     (fitted,) = fit_identifications(
         replace(
             identifications,

@@ -132,10 +132,10 @@ def test_each_line_is_a_separate_identification(lines: tuple[Selection, ...]) ->
     assert [identification.effect for identification in lines] == ["spectral_line"] * 3
     assert all(identification.axes == ("x",) for identification in lines)
     assert all(
-        len({component.place for component in identification.components}) == 1
+        len({component.line_index for component in identification.components}) == 1
         for identification in lines
     )
-    assert len({identification.components[0].place for identification in lines}) == 3
+    assert len({identification.components[0].line_index for identification in lines}) == 3
     assert all(
         {"real_motion", "supply_bias", "feedback_reset"} <= set(identification.alternatives)
         for identification in lines
@@ -159,7 +159,9 @@ def test_evidence_is_recalled_only_where_nothing_has_changed() -> None:
     lost = blocks.assign(mean=blocks["mean"].where(blocks["begin"] > 0.0))
     states = {
         "line": with_line,
-        "another line in its band": condition_on(with_line, [replace(line, place=line.place + 1)]),
+        "another line in its band": condition_on(
+            with_line, [replace(line, line_index=line.line_index + 1)]
+        ),
         "jump": with_jump,
         "lost block": replace(start, blocks=lost),
         "other weights": replace(start, expected_power=1.1 * start.expected_power),

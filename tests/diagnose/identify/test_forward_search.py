@@ -339,7 +339,7 @@ def test_every_line_of_a_comb_is_identified():
     } == {("spectral_line", ("x",))}
     assert (
         sorted(
-            component.place
+            component.line_index
             for identification in identifications.identified
             for component in identification.components
         )

@@ -363,7 +363,7 @@ def turning():
 def identification(blocks, effect, statistic):
     candidates, _ = effect_candidates(blocks, COEFFICIENT)
     candidate = select_candidate(candidates, effect, statistic)
-    component = Component(candidate, candidate.variants[0], ("x",), 50.0, place=0)
+    component = Component(candidate, candidate.variants[0], ("x",), 50.0, line_index=0)
     return Selection(effect, candidate.driver, ("x",), (component,), 50.0, 8.0)
 
 
