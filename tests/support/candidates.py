@@ -17,7 +17,7 @@ from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 
 
 def select_candidate(candidates: Iterable[Candidate], effect: str, statistic: str) -> Candidate:

@@ -25,8 +25,8 @@ from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS
-from gyrostab.diagnose.statistics.candidates import effect_candidates
-from gyrostab.diagnose.statistics.wording import COARSE_ANGLE_GRID
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
+from gyrostab.diagnose.statistics.mismatch_wording import COARSE_ANGLE_GRID
 from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
 
@@ -111,7 +111,7 @@ def prepare_examination(
             if has_coarse_grid(blocks).any()
             else "not identifiable: the quantization grid is that of angles, or too fine to show"
         )
-    threshold = fit_best_evidence(best, settings=settings).level(level)
+    threshold = fit_best_evidence(best, settings=settings).value_at(level)
     return Examination(
         candidates, folds, count_evidence, threshold, start, tuple(model_effects), best, reasons
     )

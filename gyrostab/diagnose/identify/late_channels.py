@@ -19,7 +19,7 @@ from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.windows import channel_units
 from gyrostab.diagnose.reduce.log_blocks import channel_means, is_rms_channel
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.schema.delays import move_channels
 from gyrostab.time.grid import grid_times
 

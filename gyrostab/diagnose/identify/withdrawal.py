@@ -78,9 +78,7 @@ def withdraw_effects(
         ]
         if not on_axis:
             continue
-        excess_nats = variance_fluctuation(
-            examination.state_with([*remaining, *unidentified]), axis
-        )
+        excess_nats = measure_fluctuation(examination.state_with([*remaining, *unidentified]), axis)
         weak = _find_weak(examination, on_axis, axis, excess_nats)
         if weak:
             remaining = [
@@ -168,7 +166,7 @@ def _evidence_on(selection: Selection, axis: str) -> float:
     )
 
 
-def variance_fluctuation(state: State, axis: str) -> float:
+def measure_fluctuation(state: State, axis: str) -> float:
     """Return the evidence [nats] of a power level that wanders over one that is constant.
 
     The level is that of all bands of a block together, relative to the expected one with all

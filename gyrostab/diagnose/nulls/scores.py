@@ -29,7 +29,7 @@ class MaximumDistribution:
     sample: Floats
     start: float
     scale: float
-    share: float
+    tail_share: float  # probability of the tail
 
     def surprise(self, value: Floats | float) -> Floats:
         """Return ``-log`` of the probability that a null record's largest is at least `value`."""
@@ -37,19 +37,19 @@ class MaximumDistribution:
         rank = (self.sample.size - np.searchsorted(self.sample, value) + 1.0) / (
             self.sample.size + 1.0
         )
-        beyond = (value - self.start) / self.scale - np.log(self.share)
+        beyond = (value - self.start) / self.scale - np.log(self.tail_share)
         return np.asarray(
-            np.where(value > self.start, beyond, -np.log(np.clip(rank, self.share, 1.0)))
+            np.where(value > self.start, beyond, -np.log(np.clip(rank, self.tail_share, 1.0)))
         )
 
     def probability(self, value: Floats | float) -> Floats:
         """Return the probability that a null record's largest is at least `value`."""
         return np.asarray(np.clip(np.exp(-self.surprise(value)), MIN_P_VALUE, 1.0))
 
-    def level(self, p: float) -> float:
+    def value_at(self, p: float) -> float:
         """Return the value that the largest of a null record reaches with probability `p`."""
-        if p < self.share:
-            return float(self.start + self.scale * np.log(self.share / p))
+        if p < self.tail_share:
+            return float(self.start + self.scale * np.log(self.tail_share / p))
         return float(np.quantile(self.sample, 1.0 - p))
 
 
@@ -79,7 +79,7 @@ class NullScores:
 
     def critical(self, statistic: str, level: float) -> float:
         """Return the standardised score of a statistic at which the p-value is `level`."""
-        t = self.statistics[statistic].tail.level(float(np.exp(-self.family.level(level))))
+        t = self.statistics[statistic].tail.value_at(float(np.exp(-self.family.value_at(level))))
         return float(np.sqrt(2.0 * max(t, 0.0)))
 
 
@@ -126,7 +126,7 @@ def fit_best_evidence(best: Floats, *, settings: Settings = DEFAULTS) -> Maximum
     Examples
     --------
     >>> best = fit_best_evidence(np.random.default_rng(1).exponential(size=100_000))
-    >>> abs(best.level(0.001) - np.log(1000)) < 0.1, abs(best.probability(5.0) - 0.007) < 0.001
+    >>> abs(best.value_at(0.001) - np.log(1000)) < 0.1, abs(best.probability(5.0) - 0.007) < 0.001
     (np.True_, np.True_)
     """
     return _fit_maximum(best, settings.tail_share, _MIN_EVIDENCE_SCALE)

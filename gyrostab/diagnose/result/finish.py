@@ -25,7 +25,7 @@ from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.result.attribution import attribute_mismatches
 from gyrostab.diagnose.result.content import SCHEMA, check_diagnosis
-from gyrostab.diagnose.result.diagnosis import Diagnosis, plain
+from gyrostab.diagnose.result.diagnosis import Diagnosis, to_json_types
 from gyrostab.diagnose.result.held_out_table import measure_held_out
 from gyrostab.diagnose.result.rejections import find_rejections, find_unsupported, rejected_tables
 from gyrostab.diagnose.result.surfaces import make_surfaces
@@ -101,7 +101,7 @@ def finish_diagnosis(
     turning = str(rotation.attrs.get("rotation_axis", ""))  # axis that feels this channel
     given_model = task.simulation if isinstance(task.simulation, Model) else None
     diagnosis = Diagnosis(
-        plain(content),
+        to_json_types(content),
         _make_surfaces_with_outliers(blocks, fit, before, after),
         model_tables(fit.noise, fit.fitted, given_model, blocks, turning, settings=task.settings),
     )

@@ -39,8 +39,8 @@ from gyrostab.diagnose.result.text import (
 )
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
-from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.noise import LAWS
 from gyrostab.physics.sampling import FAST_INSTRUMENT_SAMPLES, LoggerFilter
 from gyrostab.simulate.model import Model

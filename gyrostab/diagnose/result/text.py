@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gyrostab.diagnose.statistics import find_statistic
-from gyrostab.diagnose.statistics.wording import axes_text, subject
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text, capitalise_axes
 from gyrostab.physics.registry import effects
 from gyrostab.wording import join_words
 
@@ -123,7 +123,7 @@ def motion_statement(axis: str, when: str, largest: float, followers: Sequence[s
     size = f"by up to {largest:.3g} deg/h"
     text = f"The rate of axis {axis} moves far beyond its noise {when}, {size}"
     if followers:
-        them = subject({"axes": followers})
+        them = capitalise_axes({"axes": followers})
         return (
             f"{text}. {them} {'senses' if len(followers) == 1 else 'sense'} part of it, so it "
             "is real rotation of the tool; no channel records its true rate."

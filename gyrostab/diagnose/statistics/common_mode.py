@@ -13,6 +13,7 @@ from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.cross_spectrum import correlation_score
 from gyrostab.diagnose.statistics.mean import slow_coefficients
+from gyrostab.diagnose.statistics.mismatch_wording import capitalise_axes, taus_text
 from gyrostab.diagnose.statistics.scores import (
     Windows,
     cube_root_score,
@@ -21,7 +22,6 @@ from gyrostab.diagnose.statistics.scores import (
     sum_over_windows,
     window_set,
 )
-from gyrostab.diagnose.statistics.wording import subject, taus_text
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.units import HOUR
 
@@ -101,8 +101,8 @@ class CommonMode(Statistic):
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
         return (
-            f"{subject(region)} drift together (correlation {region['estimate']:.2g}) {when}, at "
-            f"{taus_text(region)}, which the random walks of independent gyros do not"
+            f"{capitalise_axes(region)} drift together (correlation {region['estimate']:.2g}) {when}, "
+            f"at {taus_text(region)}, which the random walks of independent gyros do not"
         )
 
 

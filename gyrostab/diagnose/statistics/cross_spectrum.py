@@ -34,6 +34,7 @@ from gyrostab.diagnose.predict.linear_model import (
 )
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
+from gyrostab.diagnose.statistics.mismatch_wording import capitalise_axes, taus_text
 from gyrostab.diagnose.statistics.power import with_axis
 from gyrostab.diagnose.statistics.scores import (
     Windows,
@@ -43,7 +44,6 @@ from gyrostab.diagnose.statistics.scores import (
     window_set,
 )
 from gyrostab.diagnose.statistics.shared_factors import estimate_shared_factors
-from gyrostab.diagnose.statistics.wording import subject, taus_text
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (5, 15, 45)
@@ -196,7 +196,7 @@ class CrossSpectrum(Statistic):
         estimate = region.get("estimate", np.nan)
         size = f" (coherency {estimate:.2g})" if np.isfinite(estimate) else ""
         return (
-            f"{subject(region)} vary together{size} {when}, at {taus_text(region)}, which "
+            f"{capitalise_axes(region)} vary together{size} {when}, at {taus_text(region)}, which "
             "independent gyros do not"
         )
 

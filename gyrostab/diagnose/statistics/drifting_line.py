@@ -12,6 +12,7 @@ from scipy.special import log_ndtr
 from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
 from gyrostab.diagnose.statistics.base import Statistic
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
     Windows,
@@ -21,7 +22,6 @@ from gyrostab.diagnose.statistics.scores import (
     part_windows,
     statistic_dataset,
 )
-from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.kernels.spectra.line_levels import local_level
 
 _SPECTRUM_SECTIONS = 8  # in which paths begin and end; design choice

@@ -35,13 +35,13 @@ from gyrostab.diagnose.statistics.jump_forms import (
     restart_competitors,
     scatter_competitors,
 )
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text, is_higher
 from gyrostab.diagnose.statistics.scores import (
     Windows,
     statistic_dataset,
     sum_over_windows,
     window_set,
 )
-from gyrostab.diagnose.statistics.wording import axes_text, is_higher
 from gyrostab.kernels.regression.boxcars import (
     boxcar_information,
     filter_gains,

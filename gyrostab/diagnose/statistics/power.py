@@ -38,8 +38,8 @@ from gyrostab.diagnose.reduce.accumulate import RECORD_PARTS
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, choose_columns
+from gyrostab.diagnose.statistics.mismatch_wording import capitalise_axes, is_higher, taus_text
 from gyrostab.diagnose.statistics.scores import cube_root_score, statistic_dataset
-from gyrostab.diagnose.statistics.wording import is_higher, subject, taus_text
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.registry import effects
 
@@ -189,7 +189,7 @@ class Power(Statistic):
     def describe(self, region: Region, when: str) -> str:
         is_single = len(region["axes"]) == 1
         return (
-            f"{subject(region)} {'is' if is_single else 'are'} "
+            f"{capitalise_axes(region)} {'is' if is_single else 'are'} "
             f"{'noisier' if is_higher(region) else 'quieter'} than the simulation {when}: "
             f"at {taus_text(region)} {'its' if is_single else 'their'} Allan variance is "
             f"{region['ratio']:.3g} times the expected value"

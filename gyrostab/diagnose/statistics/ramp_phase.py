@@ -21,6 +21,7 @@ from gyrostab.diagnose.predict.linear_model import (
 )
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.statistics.base import NullDraw, Statistic, choose_columns
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.diagnose.statistics.rotation_order import score_orders, turns_per_second
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
@@ -30,7 +31,6 @@ from gyrostab.diagnose.statistics.scores import (
     sum_over_windows,
     window_set,
 )
-from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 from gyrostab.physics.phase import fold
 

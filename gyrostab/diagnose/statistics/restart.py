@@ -11,8 +11,8 @@ import xarray as xr
 from gyrostab.arrays import Floats
 from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.mean import MeanNoise, apply_precision, mean_noise
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.diagnose.statistics.scores import Windows, statistic_dataset
-from gyrostab.diagnose.statistics.wording import axes_text
 
 _DECAY_BLOCKS = (2, 6, 18)  # in which a transient falls to 1/e; design choice
 _SIDE_BLOCKS = 15  # before and after a restart, that are compared; design choice

@@ -40,9 +40,9 @@ from gyrostab.diagnose.reduce.outliers import (
 from gyrostab.diagnose.reduce.zero_bin import sticking_axes, truncated_axes
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.base import NullDraw, Region, SizeFit, Sizes, Statistic
+from gyrostab.diagnose.statistics.mismatch_wording import capitalise_axes
 from gyrostab.diagnose.statistics.sample_sizes import estimate_from_counts
 from gyrostab.diagnose.statistics.scores import statistic_dataset, sum_over_windows, window_set
-from gyrostab.diagnose.statistics.wording import subject
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (1, 5, 15)
@@ -206,7 +206,7 @@ class SampleCounts(Statistic):
     def describe(self, region: Region, when: str) -> str:
         samples = _COUNT_TEXTS.get(str(region["what"]), "an unusual distribution of its samples")
         verb = "has" if len(region["axes"]) == 1 else "have"
-        return f"{subject(region)} {verb} {samples} {when}"
+        return f"{capitalise_axes(region)} {verb} {samples} {when}"
 
 
 def _kurtosis_score(excess: Floats, samples: Floats) -> tuple[Floats, Floats]:

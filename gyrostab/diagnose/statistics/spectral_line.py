@@ -36,6 +36,7 @@ from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.base import Region, SizeFit, Sizes, Statistic
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
     Windows,
@@ -46,7 +47,6 @@ from gyrostab.diagnose.statistics.scores import (
     statistic_dataset,
     sum_over_windows,
 )
-from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES, local_level
 
 _WIDTH_LINES = 5  # of a line with its leakage

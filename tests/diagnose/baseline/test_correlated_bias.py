@@ -20,7 +20,7 @@ from gyrostab.diagnose.predict.condition import condition_on, refit_powers
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.noise import NORMAL_95
 from gyrostab.simulate import simulate
 

@@ -22,7 +22,7 @@ from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.settings import DEFAULTS
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.diagnose.statistics.spectral_line import estimate_line, line_quality
 from gyrostab.simulate import simulate
 from tests.support import candidates as by_hand

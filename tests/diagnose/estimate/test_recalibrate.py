@@ -23,7 +23,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.diagnose.settings import DEFAULTS
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.physics.electronics import GaussMarkov
 from gyrostab.simulate import simulate
 from tests.support.candidates import identify_by_hand, make_identifications, select_candidate

@@ -17,7 +17,7 @@ from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.diagnose.statistics.power import burst_intervals
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import find_components

@@ -19,7 +19,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import DEFAULTS
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.diagnose.task import Task, take_lines_at_rest
 from gyrostab.ingest.make_log import make_log
 from gyrostab.progress import no_stage

@@ -25,7 +25,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.ingest.make_log import make_log
 
 MODEL = {"noise": {"N": 0.003, "K": 0.005}, "log": {"axes": ["x"]}}

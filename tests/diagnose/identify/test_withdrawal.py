@@ -15,7 +15,7 @@ from gyrostab.diagnose.identify import withdrawal
 from gyrostab.diagnose.identify.examination import Examination, nuisance_alternatives
 from gyrostab.diagnose.identify.forward_search import _select_all
 from gyrostab.diagnose.identify.selections import Selection
-from gyrostab.diagnose.identify.withdrawal import variance_fluctuation
+from gyrostab.diagnose.identify.withdrawal import measure_fluctuation
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import refit_powers
 from gyrostab.diagnose.predict.linear_model import State, initial_state
@@ -43,7 +43,7 @@ def fluctuation_left(blocks: xr.Dataset, *columns: np.ndarray) -> float:
         np.broadcast_to(column[:, None], state.expected_power.shape[1:]).astype(float)
         for column in columns
     ]
-    return variance_fluctuation(
+    return measure_fluctuation(
         refit_powers(state.with_columns("power", "x", spread)) if columns else state, "x"
     )
 
@@ -61,7 +61,7 @@ def test_noise_that_fluctuates_on_one_axis_stays_named_on_the_others(monkeypatch
     )
     selection = Selection("vibration_noise", ("vibration",), ("x", "y", "z"), components, 227.0, 8)
     monkeypatch.setattr(
-        withdrawal, "variance_fluctuation", lambda state, axis: 20.0 if axis == "x" else 0.0
+        withdrawal, "measure_fluctuation", lambda state, axis: 20.0 if axis == "x" else 0.0
     )
     examination = Examination(
         [], fold_blocks(blocks), CountEvidence({}), 8.0, start, (), np.zeros(1), {}
@@ -100,8 +100,8 @@ def test_masked_blocks_do_not_count() -> None:
     burst[20:40] = 1.5
     blocks = record(burst)
     state = initial_state(blocks, calibrate_noise(blocks))
-    assert variance_fluctuation(state, "x") > 8.0
-    assert variance_fluctuation(replace(state, masked=(burst > 1.0)[None]), "x") < 2.0
+    assert measure_fluctuation(state, "x") > 8.0
+    assert measure_fluctuation(replace(state, masked=(burst > 1.0)[None]), "x") < 2.0
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from gyrostab.diagnose.reduce.moving_blocks import (
 from gyrostab.diagnose.result.tables import motion_mismatches
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate

@@ -21,7 +21,7 @@ from gyrostab.diagnose.result.attribution import (
     needed_effects,
 )
 from gyrostab.diagnose.statistics import find_statistic
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.diagnose.statistics.sample_counts import find_anomalous_blocks
 from tests.support.candidates import make_identifications, select_candidate
 from tests.support.named import COEFFICIENT, WORLD, nulls, record

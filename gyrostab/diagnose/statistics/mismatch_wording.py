@@ -27,7 +27,7 @@ def length_text(seconds: float) -> str:
     return f"{seconds:.3g} s" if seconds >= 0.1 else f"{seconds * 1e3:.3g} ms"
 
 
-def subject(region: Mapping[str, Any]) -> str:
+def capitalise_axes(region: Mapping[str, Any]) -> str:
     """Write the axes of a mismatch as the beginning of a sentence."""
     axes = axes_text(region["axes"])
     return axes[0].upper() + axes[1:]

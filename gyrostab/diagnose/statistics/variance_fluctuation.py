@@ -12,6 +12,7 @@ import xarray as xr
 from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
 from gyrostab.diagnose.statistics.base import Statistic
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text, length_text, taus_text
 from gyrostab.diagnose.statistics.power import LEVEL_COLUMNS
 from gyrostab.diagnose.statistics.scores import (
     Windows,
@@ -20,7 +21,6 @@ from gyrostab.diagnose.statistics.scores import (
     sum_over_windows,
     window_set,
 )
-from gyrostab.diagnose.statistics.wording import axes_text, length_text, taus_text
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (20, 80)
@@ -33,10 +33,10 @@ _MIN_FREQUENCY_LINES = 3.5  # lower bands show a mean that moves within blocks r
 _MAX_AVERAGE_SIGMA = 4.0
 
 
-class VarianceStability(Statistic):
+class VarianceFluctuation(Statistic):
     """Variance fluctuation: powers that scatter more than their degrees of freedom allow."""
 
-    name = "variance_stability"
+    name = "variance_fluctuation"
     view = "davar"
     is_ratio = True
 
