@@ -70,7 +70,16 @@ def baseline_from_model(
         draws = np.tile(square, (DRAWS, 1))
         K, B = np.array([coefficients["K"]]), np.array([coefficients["B"]])
         posteriors.append(
-            Posterior(square, np.zeros(4), K, B, np.ones(1), draws, draws[:, 2:], True)
+            Posterior(
+                square=square,
+                error=np.zeros(4),
+                K=K,
+                B=B,
+                weight=np.ones(1),
+                draws=draws,
+                slow=draws[:, 2:],
+                joined=True,
+            )
         )
     chosen = np.ones((len(axes), blocks.sizes["block"]), np.bool_)
     attrs: dict[str, Any] = {"source": "model", "calibrated_on": [], "model": parsed.source}

@@ -17,6 +17,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     undo_transfer,
 )
 from gyrostab.diagnose.baseline.known_lines import (
+    LinePower,
     expect_lines,
     independent_line_share,
     line_factors,
@@ -71,9 +72,9 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Floats) -> Kn
     squares = np.repeat(square[:, None], shape[1], axis=1)
     # factors of filters on the noise terms, (axis, band, term)
     added, response = np.zeros(shape), np.ones((shape[0], shape[2], len(NOISE)))
-    narrow: list[tuple[Effect, list[int], Floats]] = []
-    coherent: list[tuple[Complexes, Floats]] = []
-    wandering: list[tuple[Prediction, list[int], Callable[[str], Floats]]] = []
+    line_powers: list[LinePower] = []
+    shared_powers: list[tuple[Complexes, Floats]] = []  # factor of each axis, and the density
+    processes_on_rows: list[ProcessesOnRows] = []
     left_out = []
     for effect, rows in _effects_on_rows(model, axes):
         of_effect = tuple(axes[row] for row in rows)
@@ -96,19 +97,19 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Floats) -> Kn
             power = np.abs(factor[:, None, None]) ** 2 * density
             added += power
             if prediction.coherent:
-                coherent.append((factor, density))
+                shared_powers.append((factor, density))
             if prediction.line is not None and factor.any():
-                narrow.append((effect, rows, power))
-        wandering.append((prediction, rows, sizes))
+                line_powers.append(LinePower(effect, rows, power))
+        processes_on_rows.append(ProcessesOnRows(prediction, rows, sizes))
     white_response = response[:, None, :, NOISE.index("N")]
     noise = np.einsum("fn,afn,abn->abf", band_columns(blocks), response, np.maximum(squares, 0.0))
     spectrum = spread_by_gaps((noise + added * white_response) * left[..., None], blocks)
-    variables = _shared_cross(coherent, white_response, blocks)
+    variables = _shared_cross(shared_powers, white_response, blocks)
     if (response != 1.0).any():
         variables["line_noise"] = _filtered_lines(model, square, blocks)
-    if narrow:
-        variables |= expect_lines(blocks, narrow, white_response[:, 0])
-    processes, power = random_means(wandering, shape)
+    if line_powers:
+        variables |= expect_lines(blocks, line_powers, white_response[:, 0])
+    processes, power = random_means(processes_on_rows, shape)
     white_share = 1.0 - power / np.maximum(spectrum[..., 0], np.finfo(float).tiny)
     return KnownEffects(mean, spectrum, white_share, variables | processes, left_out)
 
@@ -183,18 +184,24 @@ def _added_powers(
         yield factor, density
 
 
+class ProcessesOnRows(NamedTuple):
+    """An effect whose random processes may move the block means."""
+
+    prediction: Prediction
+    rows: list[int]  # of the axes
+    sizes: Callable[[str], Floats]  # parameter -> its size on each of these rows
+
+
 def random_means(
-    wandering: Sequence[tuple[Prediction, list[int], Callable[[str], Floats]]],
-    shape: tuple[int, ...],
+    processes_on_rows: Sequence[ProcessesOnRows], shape: tuple[int, ...]
 ) -> tuple[dict[str, Array], Floats]:
     """Return the steady processes of effects as variables, and their power in the lowest band.
 
-    Whatever they add there is not white noise of the means. Each effect comes with its rows, and
-    its sizes on them.
+    Whatever they add there is not white noise of the means.
     """
     processes: list[tuple[Floats, float]] = []  # variance on each axis, correlation time
     walk, power = np.zeros((2, *shape[:2]))  # variance rate of random walks, and power of all
-    for prediction, rows, sizes in wandering:
+    for prediction, rows, sizes in processes_on_rows:
         for name, (time, variance) in prediction.wander.items():
             if prediction.levels or not _is_steady(time, variance):
                 continue
@@ -240,7 +247,7 @@ def _is_steady(time: float, variance: Floats) -> bool:
 
 
 def _shared_cross(
-    coherent: Sequence[tuple[Complexes, Floats]], response: Floats, blocks: xr.Dataset
+    shared_powers: Sequence[tuple[Complexes, Floats]], response: Floats, blocks: xr.Dataset
 ) -> dict[str, Array]:
     """Return the cross-spectrum of coherent effects after a filter (axis, 1, band), if any.
 
@@ -248,7 +255,7 @@ def _shared_cross(
     """
     first, second = pair_indices(blocks)
     shared = np.zeros(blocks["cross"].shape, np.complex128)
-    for factor, density in coherent:
+    for factor, density in shared_powers:
         product = factor[first] * np.conj(factor[second])
         shared += product[:, None, None] * np.sqrt(density[first] * density[second])
     shared *= np.sqrt(response[first] * response[second])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -29,13 +30,18 @@ _FINER = 2 * _PLACES_BETWEEN  # frequencies for each line
 _PEAK_POINTS = 1000  # within a step of a density
 
 
-def expect_lines(
-    blocks: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], Floats]], response: Floats
-) -> dict[str, Floats]:
-    """Return lines of effects after a filter (axis, band), as variables of a baseline.
+class LinePower(NamedTuple):
+    """An effect that makes lines."""
 
-    The effects come with their axes and their power in the bands.
-    """
+    effect: Effect
+    rows: list[int]  # of the axes
+    power: Floats  # (axis, block, band)
+
+
+def expect_lines(
+    blocks: xr.Dataset, line_powers: Sequence[LinePower], response: Floats
+) -> dict[str, Floats]:
+    """Return lines of effects after a filter (axis, band), as variables of a baseline."""
     axes = [str(axis) for axis in blocks["axis"].values]
     frequency, bands = blocks["line_frequency"].values, blocks["frequency"].values
     passed = np.stack(
@@ -45,7 +51,7 @@ def expect_lines(
     unspread, band_power = unspread_share(blocks)[..., None], np.zeros((len(axes), bands.size))
     block_size = int(blocks.attrs["block_samples"])
     leak, mean_leak, largest_leak = _line_leakage(block_size)
-    for effect, rows, density in narrow:
+    for effect, rows, density in line_powers:
         chosen = tuple(axes[row] for row in rows)
         prediction = predict_effect(effect, blocks, chosen, frequency)
         band_power += (unspread * density).mean(axis=1) * response

@@ -21,7 +21,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     reduced_shape,
     white_variance,
 )
-from gyrostab.diagnose.baseline.known_effects import random_means
+from gyrostab.diagnose.baseline.known_effects import ProcessesOnRows, random_means
 from gyrostab.diagnose.baseline.posterior import (
     Fit,
     Posterior,
@@ -190,7 +190,17 @@ def _kept_posterior(baseline: xr.Dataset, row: int) -> Posterior:
     weight = np.exp(axis_baseline["grid_calibrated"].values)
     angle = float(axis_baseline["angle_variance"])
     weight /= weight.sum()
-    return Posterior(square, error, K, B, weight, draws, slow, True, angle=angle)
+    return Posterior(
+        square=square,
+        error=error,
+        K=K,
+        B=B,
+        weight=weight,
+        draws=draws,
+        slow=slow,
+        joined=True,
+        angle=angle,
+    )
 
 
 def _collect_effects(
@@ -245,7 +255,7 @@ def _find_processes(fitted: Sequence[Fitted], blocks: xr.Dataset) -> dict[str, A
     The bias of two levels is one unless its course is in the model.
     """
     axes = [str(axis) for axis in blocks["axis"].values]
-    wandering = []
+    processes_on_rows = []
     for effect_fit in fitted:
         effect = effect_fit.effect
         if effect is None:
@@ -254,9 +264,10 @@ def _find_processes(fitted: Sequence[Fitted], blocks: xr.Dataset) -> dict[str, A
         if not any(component.statistic.is_switching for component in effect_fit.components):
             prediction = replace(prediction, levels="")
         sizes = partial(effect.expand_to_axes, axes=effect_fit.axes)
-        wandering.append((prediction, [axes.index(axis) for axis in effect_fit.axes], sizes))
+        rows = [axes.index(axis) for axis in effect_fit.axes]
+        processes_on_rows.append(ProcessesOnRows(prediction, rows, sizes))
     shape = tuple(blocks.sizes[name] for name in ("axis", "block", "band"))
-    return label_variables(random_means(wandering, shape)[0], BASELINE)
+    return label_variables(random_means(processes_on_rows, shape)[0], BASELINE)
 
 
 def _effect_power(effect: Effect, blocks: xr.Dataset, axis: str) -> Floats:

@@ -87,21 +87,23 @@ def _select_all(examination: Examination) -> tuple[list[Selection], dict[str, tu
     }
     effects_left, lines_left = MAX_EFFECTS, MAX_LINES
     beaten: dict[str, tuple[str, float]] = {}
-    is_last = False
+    includes_last_resorts = False
     while effects_left > 0:
-        all_evidence = score_candidates(examination, state, barred, with_last=is_last)
+        all_evidence = score_candidates(
+            examination, state, barred, includes_last_resorts=includes_last_resorts
+        )
         selected = _select_next(examination, all_evidence, state, chosen, beaten)
         selections, shifted = selected or ([], {})
         beaten |= shifted
         barred |= shifted.keys()
         if shifted and not selections:
             continue
-        if not is_last and not any(choice.is_named for choice in selections):
-            is_last = True
+        if not includes_last_resorts and not any(choice.is_named for choice in selections):
+            includes_last_resorts = True  # nothing else passes
             continue
         if not selections:
             break
-        is_last = False
+        includes_last_resorts = False
         for selection in selections:
             if are_lines(selection.components):
                 lines_left -= 1
@@ -135,17 +137,23 @@ def _explained_count_keys(examination: Examination, selection: Selection) -> set
 
 
 def score_candidates(
-    examination: Examination, state: State, barred: Collection[str], *, with_last: bool = True
+    examination: Examination,
+    state: State,
+    barred: Collection[str],
+    *,
+    includes_last_resorts: bool = True,
 ) -> list[CandidateEvidence]:
-    """Compute the evidence of all candidates that are not barred.
+    """Compute the evidence of all candidates that are not barred, last resorts as an option.
 
+    These are in statistics that are tried last (`is_tried_last`).
     Powers are weighted with the strongest effect in the powers, because its noise is in every
     statistic.
     """
     sought = [
         candidate
         for candidate in examination.candidates
-        if candidate.key not in barred and (with_last or not candidate.statistic.is_tried_last)
+        if candidate.key not in barred
+        and (includes_last_resorts or not candidate.statistic.is_tried_last)
     ]
     all_evidence = examination.compute_evidence(sought, state)
     weighted = [

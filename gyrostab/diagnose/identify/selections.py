@@ -62,10 +62,10 @@ def conditioned_states(start: State, chosen: Sequence[Selection]) -> Iterator[St
     What consecutive lines add to the powers is fitted once for all of them, after the last.
     """
     state = start
-    of_lines = [are_lines(selection.components) for selection in chosen]
+    is_line_only = [are_lines(selection.components) for selection in chosen]
     for number, selection in enumerate(chosen):
         state = condition_on_components(state, selection.components)
-        if not all(of_lines[number : number + 2]) or number + 1 == len(chosen):
+        if not all(is_line_only[number : number + 2]) or number + 1 == len(chosen):
             state = refit_powers(state)
         yield state
 
@@ -201,7 +201,7 @@ def form_error(
                 and own.statistic.error_shows_in[0] in component.statistic.error_shows_in
                 and {*own.row} & {*component.row}
             ]
-            of_spectrum = (
+            is_spectral = (
                 component.statistic.is_power
                 and bool(selection.driver)
                 and any(
@@ -209,6 +209,6 @@ def form_error(
                     for candidate in affected_candidates
                 )
             )
-            share = settings.spectrum_error_share if of_spectrum else settings.form_error_share
+            share = settings.spectrum_error_share if is_spectral else settings.form_error_share
             error += share * component.evidence_nats if affected_candidates else 0.0
     return error

@@ -109,13 +109,13 @@ def _finish_identification(
     rivals += find_equivalent_effects(
         identification.effect, identification.components, state, lines=len(lines)
     )
-    of_any_spectrum = find_spectral_alternatives(
+    spectral_alternatives = find_spectral_alternatives(
         identification.effect,
         [component for layer in layers for component in layer],
         weighted,
         examination,
     )
-    rivals += of_any_spectrum
+    rivals += spectral_alternatives
     alternatives = dict.fromkeys([*identification.alternatives, *rivals])
     alternatives.pop(identification.effect, None)
     components = tuple(
@@ -131,7 +131,7 @@ def _finish_identification(
         alternatives=tuple(alternatives),
         components=components,
         # as probable as this effect, whatever their own form explains
-        instead=sum_by_key(on_axes) | dict.fromkeys(of_any_spectrum, evidence_nats),
+        instead=sum_by_key(on_axes) | dict.fromkeys(spectral_alternatives, evidence_nats),
     )
 
 

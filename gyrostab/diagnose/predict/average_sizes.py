@@ -298,7 +298,7 @@ def refine_grid(component: Component, state: State, points: Sequence[Point]) -> 
     grid = _Grid(component, state, *scale, points)
     for line in grid.lines:
         for down in (True, False) if len(line) > 1 else ():
-            grid.extend_line(line, down)
+            grid.extend_line(line, down=down)
     for _ in range(MAX_ROUNDS):
         if not grid.halve_steps(max(MAX_ADDED_POINTS - len(grid.points) + len(points), 0)):
             break
@@ -373,7 +373,7 @@ class _Grid:
             added.append(self._add_point(line, left, middle, 0.5 * (left.place + right.place)))
         return any(point is not None for point in added)
 
-    def extend_line(self, line: list[Point], down: bool) -> None:
+    def extend_line(self, line: list[Point], *, down: bool) -> None:
         """Add points beyond an end of a line, in steps like the last one.
 
         They continue while the likelihood rises and is within `LIKELY_NATS` of the largest. A lag

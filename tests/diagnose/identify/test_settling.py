@@ -180,7 +180,9 @@ def test_what_fails_the_time_shift_test_is_barred_before_random_biases_are_tried
     monkeypatch.setattr(
         forward_search,
         "score_candidates",
-        lambda examination, state, barred, with_last: tried.append(({*barred}, with_last)),
+        lambda examination, state, barred, includes_last_resorts: tried.append(
+            ({*barred}, includes_last_resorts)
+        ),
     )
     monkeypatch.setattr(forward_search, "_select_next", lambda *given: next(answers))
     chosen, beaten = forward_search._select_all(SimpleNamespace(start=None, expected=()))
