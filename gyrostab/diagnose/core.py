@@ -18,14 +18,14 @@ from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion, filtered_blocks
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.estimate.conditioned_baseline import expected_baseline, without_expected
-from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.recalibrate import remove_fast_switching
 from gyrostab.diagnose.estimate.unexplained_motion import unexplained_motion
 from gyrostab.diagnose.identify.examination import prepare_examination
+from gyrostab.diagnose.identify.forms import choose_forms
 from gyrostab.diagnose.identify.forward_search import identify_effects
 from gyrostab.diagnose.identify.late_channels import find_late_channel
 from gyrostab.diagnose.identify.selections import components_of
-from gyrostab.diagnose.locate.mismatches import Region, locate_mismatches
+from gyrostab.diagnose.locate.mismatches import locate_mismatches
 from gyrostab.diagnose.nulls.records import repeatable_null_records
 from gyrostab.diagnose.nulls.scores import NullScores, null_scores
 from gyrostab.diagnose.predict.linear_model import initial_state
@@ -34,6 +34,7 @@ from gyrostab.diagnose.result.attribution import drop_expected
 from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.diagnose.result.finish import finish_diagnosis
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.statistics.base import Region
 from gyrostab.diagnose.task import (
     NamedBlocks,
     Task,
@@ -237,7 +238,7 @@ def _identify_effects(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> N
         progress=task.progress,
         settings=task.settings,
     )
-    identifications = settle_forms(identify_effects(examination), baseline)
+    identifications = choose_forms(identify_effects(examination), baseline)
     return NamedBlocks(blocks, baseline, records, identifications)
 
 
@@ -312,7 +313,7 @@ def _leave_motion_out_of_lines(task: Task, named: NamedBlocks) -> NamedBlocks | 
     # with the threshold of the null records so far
     start = initial_state(blocks_without_lines, baseline, settings=task.settings)
     examination = replace(identifications.examination, start=start)
-    identifications = settle_forms(identify_effects(examination), baseline)
+    identifications = choose_forms(identify_effects(examination), baseline)
     return NamedBlocks(blocks, baseline, records, identifications)
 
 

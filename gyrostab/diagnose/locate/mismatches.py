@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,15 +11,10 @@ from gyrostab.arrays import Floats, Ints
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS, Statistic, find_statistic
+from gyrostab.diagnose.statistics.base import Region
 from gyrostab.diagnose.statistics.mean import region_mean
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 
-#: Fields of a place where recording and simulation differ: ``statistic``, ``view``, ``axes``
-#: (separated by blanks), ``what``, ``begin``, ``end`` [s since the start], ``tau_min_s``,
-#: ``tau_max_s`` [s], ``frequency`` [Hz], ``sign`` (0 for a mean that wanders), ``z``, ``ratio``
-#: (observed over expected; for means and restarts the number of standard deviations), ``estimate``
-#: (depends on the statistic), ``p_value``.
-Region = dict[str, Any]
 #: Ratios of averaging times that are equal but for rounding.
 MIN_TAU_RATIO, MAX_TAU_RATIO = 0.99, 1.01
 #: On either side of a window, in which the time of its region is sought [lengths of the window].
@@ -72,7 +66,7 @@ def _locate_regions(
     z = standardise(first, null.statistics[statistic.name])
     regions = []
     for row in range(z.shape[0]):
-        now, scores, row_z = baseline, first, z[row]
+        remaining_baseline, scores, row_z = baseline, first, z[row]
         remaining = row_z.copy()
         for _ in range(MAX_PER_ROW):
             region = _take_region(statistic, scores, row, remaining, row_z, null, level)
@@ -80,8 +74,8 @@ def _locate_regions(
                 break
             regions.append(region)
             if statistic.is_linear_in_means:
-                now = _without_region(region, blocks, now, row)
-                rescored = statistic.score(blocks, now)
+                remaining_baseline = _without_region(region, blocks, remaining_baseline, row)
+                rescored = statistic.score(blocks, remaining_baseline)
                 if rescored is None:
                     break
                 scores = rescored
@@ -133,7 +127,7 @@ def _take_region(
     if np.isfinite(combined[column]):
         largest = max(largest, combined[column])
     columns, reach = _find_columns(statistic, scores, combined, ratio, int(column), null.settings)
-    region = {
+    region: Region = {
         "statistic": statistic.name,
         "view": statistic.view,
         "axes": str(scores["axes"].values[row]),
@@ -286,7 +280,7 @@ def merge_regions(regions: Sequence[Region], *, settings: Settings = DEFAULTS) -
                 _extend_region(other, region, settings)
                 break
         else:
-            merged.append(dict(region))
+            merged.append(region.copy())
     return merged
 
 
@@ -311,7 +305,7 @@ def _are_alike(region: Region, other: Region, settings: Settings) -> bool:
 
 def _kind_of(region: Region) -> str:
     """Return the kind of a region; regions of different kinds are not merged."""
-    kind = str(region["what"]).split(" ")[0]
+    kind = region["what"].split(" ")[0]
     return kind if kind in _SEPARATE_KINDS else ""
 
 

@@ -12,7 +12,6 @@ import xarray as xr
 from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_motion
 from gyrostab.diagnose.identify.selections import Selection, components_of
-from gyrostab.diagnose.locate.mismatches import Region
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import drop_changed_tails, find_bands, mean_columns
@@ -20,6 +19,7 @@ from gyrostab.diagnose.predict.linear_model import pair_rows
 from gyrostab.diagnose.reduce.schema import weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS, find_statistic
+from gyrostab.diagnose.statistics.base import Region
 from gyrostab.diagnose.statistics.sample_counts import find_anomalous_blocks, mask_anomalous_blocks
 
 MAX_SPANS = 6  # more intervals than that are reported as the whole record
@@ -197,10 +197,10 @@ def _components_at(
         if component.statistic.can_explain(component, region, blocks, settings)
         and (has_moved or not component.statistic.is_in_means or region["view"] != "spectrum")
     ]
-    common = set(str(region["axes"]).split()) & set(effect.identification.axes)
+    common = set(region["axes"].split()) & set(effect.identification.axes)
     if not components or not common:
         return []
-    together = str(region["what"]) == "slow" and len(common) > 1
+    together = region["what"] == "slow" and len(common) > 1
     if is_left and all(
         component.statistic.is_modelled_in(region, together=together) for component in components
     ):
@@ -265,7 +265,7 @@ def _is_caused_elsewhere(
     The constant of a record is free: a mean that is higher in one part is lower in the rest, and
     either may be the mismatch. A mean that differs after a restart may be due to an effect before.
     """
-    if str(region["view"]) not in ("mean", "restart") or not all(
+    if region["view"] not in ("mean", "restart") or not all(
         component.statistic.is_in_means for component in components
     ):
         return False
@@ -292,9 +292,9 @@ def _overlap_seconds(region: Region, span: tuple[float, float]) -> float:
 
 def _is_within_blocks(region: Region, blocks: xr.Dataset) -> bool:
     """Return whether a mismatch concerns the inside of blocks rather than their means."""
-    return str(region["view"]) in ("spectrum", "distribution") or float(
-        region["tau_max_s"]
-    ) < float(blocks.attrs["block_s"])
+    return region["view"] in ("spectrum", "distribution") or float(region["tau_max_s"]) < float(
+        blocks.attrs["block_s"]
+    )
 
 
 def _moving_spans(
@@ -401,13 +401,13 @@ def _score_left(
     for name, statistic, z in scores:
         if (
             find_statistic(name).view != region["view"]
-            or str(region["what"]) not in statistic["what"].values
+            or region["what"] not in statistic["what"].values
         ):
             continue
         rows = [
             number
             for number, axes in enumerate(statistic["axes"].values)
-            if set(str(axes).split()) & set(str(region["axes"]).split())
+            if set(str(axes).split()) & set(region["axes"].split())
         ]
         inside = (statistic["begin"].values >= region["begin"] - 1e-6) & (
             statistic["end"].values <= region["end"] + 1e-6
@@ -416,7 +416,7 @@ def _score_left(
             statistic["tau_min_s"].values >= 0.99 * region["tau_min_s"]
         )
         columns &= statistic["tau_min_s"].values <= 1.01 * region["tau_max_s"]
-        cells = np.abs(z[np.ix_(rows, inside, columns)])
+        cells = np.abs(z[np.ix_(np.array(rows, np.intp), inside, columns)])
         if np.isfinite(cells).any():
             largest_score = max(largest_score, float(np.nanmax(cells)))
             allowed = null.settings.score_error_share * abs(float(region["z"]))
@@ -449,7 +449,7 @@ def needed_effects(
         for identification, components in shown
         if all(
             # a low-pass may be in the noise of the baseline already
-            str(region["view"]) in component.statistic.containing_views and not component.is_filter
+            region["view"] in component.statistic.containing_views and not component.is_filter
             for component in components
         )
     ]

@@ -20,7 +20,6 @@ from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.identify.components import axes_of, sum_evidence
 from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.identify.selections import Selection, reduce_selection
-from gyrostab.diagnose.locate.mismatches import Region
 from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.result.attribution import attribute_mismatches
@@ -37,6 +36,7 @@ from gyrostab.diagnose.result.tables import (
     recording_table,
 )
 from gyrostab.diagnose.result.verdict import decide_verdict
+from gyrostab.diagnose.statistics.base import Region
 from gyrostab.diagnose.task import NamedBlocks, Task, lines_without_motion
 from gyrostab.physics.registry import effects
 from gyrostab.simulate.model import Model

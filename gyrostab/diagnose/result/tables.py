@@ -19,7 +19,6 @@ from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.components import are_lines
 from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.identify.selections import Selection, components_of
-from gyrostab.diagnose.locate.mismatches import Region
 from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
 from gyrostab.diagnose.predict.candidates import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.predict.windows import channel_units, make_windows
@@ -39,6 +38,7 @@ from gyrostab.diagnose.result.text import (
 )
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.statistics.base import Region
 from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 from gyrostab.noise import LAWS

@@ -91,7 +91,7 @@ def span_text(begin: float, end: float, whole: float) -> str:
 def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
     """Write one sentence on a place where recording and simulation differ.
 
-    It is a `gyrostab.diagnose.locate.mismatches.Region` with ``axes`` as a list.
+    It is a `gyrostab.diagnose.statistics.base.Region`, but with a list of axes.
 
     Examples
     --------
@@ -103,7 +103,7 @@ def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
      this in 1 of 2 500 such records).'
     """
     when = span_text(region["begin"], region["end"], whole)
-    sentence = find_statistic(str(region["statistic"])).describe(region, when)
+    sentence = find_statistic(region["statistic"]).describe(region, when)
     return f"{sentence} ({chance(region['p_value'])})."
 
 
@@ -123,7 +123,7 @@ def motion_statement(axis: str, when: str, largest: float, followers: Sequence[s
     size = f"by up to {largest:.3g} deg/h"
     text = f"The rate of axis {axis} moves far beyond its noise {when}, {size}"
     if followers:
-        them = capitalise_axes({"axes": followers})
+        them = capitalise_axes(followers)
         return (
             f"{text}. {them} {'senses' if len(followers) == 1 else 'sense'} part of it, so it "
             "is real rotation of the tool; no channel records its true rate."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 import xarray as xr
@@ -31,7 +31,25 @@ from gyrostab.physics.prediction import Windows
 
 #: Keys are ``name``, or ``name.axis`` for a size of each of several axes.
 Sizes = Mapping[str, Size]
-Region = Mapping[str, Any]
+
+
+class Region(TypedDict):
+    """A place where recording and simulation differ."""
+
+    statistic: str  # name
+    view: str
+    axes: str  # separated by blanks
+    what: str  # which of the columns of the scores
+    begin: float  # s since the start
+    end: float
+    tau_min_s: float
+    tau_max_s: float
+    frequency: float  # Hz
+    sign: int  # 0 for a mean that wanders
+    z: float
+    p_value: float
+    ratio: float  # observed over expected; for means and restarts the number of standard deviations
+    estimate: float  # depends on the statistic
 
 
 class NullDraw(NamedTuple):
@@ -301,7 +319,7 @@ class Statistic:
         self, component: Component, region: Region, blocks: xr.Dataset, settings: Settings
     ) -> bool:
         """Return whether a component of an effect can show in a mismatch."""
-        return str(region["view"]) in self.explained_views
+        return region["view"] in self.explained_views
 
     def is_modelled_in(self, region: Region, *, together: bool) -> bool:
         """Return whether the baseline with the effects contains what an effect does to a mismatch.
@@ -314,8 +332,11 @@ class Statistic:
         """Return the averaging times [s] at which a component shows; by default within a block."""
         return 1.0 / float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
 
-    def describe(self, region: Region, when: str) -> str:
-        """Describe a mismatch in a sentence without its full stop; `when` is its time."""
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
+        """Describe a mismatch in a sentence without its full stop; `when` is its time.
+
+        The mismatch is a `Region`, but with a list of axes.
+        """
         raise NotImplementedError(f"{self.name} locates no mismatches")
 
 

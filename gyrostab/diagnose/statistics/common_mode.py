@@ -101,8 +101,9 @@ class CommonMode(Statistic):
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
         return (
-            f"{capitalise_axes(region)} drift together (correlation {region['estimate']:.2g}) "
-            f"{when}, at {taus_text(region)}, which the random walks of independent gyros do not"
+            f"{capitalise_axes(region['axes'])} drift together (correlation "
+            f"{region['estimate']:.2g}) {when}, at {taus_text(region)}, which the random walks of "
+            "independent gyros do not"
         )
 
 

@@ -196,8 +196,8 @@ class CrossSpectrum(Statistic):
         estimate = region.get("estimate", np.nan)
         size = f" (coherency {estimate:.2g})" if np.isfinite(estimate) else ""
         return (
-            f"{capitalise_axes(region)} vary together{size} {when}, at {taus_text(region)}, which "
-            "independent gyros do not"
+            f"{capitalise_axes(region['axes'])} vary together{size} {when}, at "
+            f"{taus_text(region)}, which independent gyros do not"
         )
 
 

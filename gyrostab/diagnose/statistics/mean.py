@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -103,7 +103,7 @@ class BlockMeanStatistic(Statistic):
     ) -> bool:
         """Return whether the mismatch is one of means; of several axes only a slow one."""
         is_slow = region["view"] != "cross_axis" or region["what"] == "slow"
-        return str(region["view"]) in self.explained_views and bool(is_slow)
+        return region["view"] in self.explained_views and bool(is_slow)
 
     def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
         return float(blocks.attrs["block_s"]), float(blocks["end"].values[-1]) / 2.0
@@ -196,7 +196,7 @@ class Mean(BlockMeanStatistic):
         )
         return trial.recall(compute, group, *mean_inputs(trial, axis))
 
-    def describe(self, region: Region, when: str) -> str:
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
         axes, estimate = axes_text(region["axes"]), region.get("estimate", np.nan)
         if region.get("sign", 1) == 0:
             return (
@@ -332,7 +332,7 @@ def apply_precision(series: Floats, noise: MeanNoise) -> Floats:
     return np.asarray(out.reshape(series.shape))
 
 
-def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Floats) -> float:
+def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Bools) -> float:
     """Return the constant added only in some blocks of a recording [degree hour-1].
 
     By generalised least squares with a constant of the record.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -37,7 +38,7 @@ from gyrostab.diagnose.predict.windows import hat_functions
 from gyrostab.diagnose.reduce.accumulate import RECORD_PARTS
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
-from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, choose_columns
+from gyrostab.diagnose.statistics.base import Competitor, Statistic, choose_columns
 from gyrostab.diagnose.statistics.mismatch_wording import capitalise_axes, is_higher, taus_text
 from gyrostab.diagnose.statistics.scores import cube_root_score, statistic_dataset
 from gyrostab.noise import sampled_psd
@@ -186,10 +187,10 @@ class Power(Statistic):
             [power_column(density, row, state) for density in component.variant.design],
         )
 
-    def describe(self, region: Region, when: str) -> str:
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
         is_single = len(region["axes"]) == 1
         return (
-            f"{capitalise_axes(region)} {'is' if is_single else 'are'} "
+            f"{capitalise_axes(region['axes'])} {'is' if is_single else 'are'} "
             f"{'noisier' if is_higher(region) else 'quieter'} than the simulation {when}: "
             f"at {taus_text(region)} {'its' if is_single else 'their'} Allan variance is "
             f"{region['ratio']:.3g} times the expected value"

@@ -153,7 +153,7 @@ class RampPhase(Statistic):
         return out, [], []
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        kind = str(region["what"])
+        kind = region["what"]
         component = (
             f"The rate of {axes_text(region['axes'])} has a component of "
             f"{region['estimate']:.3g} deg/h"

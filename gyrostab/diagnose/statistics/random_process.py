@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -27,7 +26,7 @@ from gyrostab.diagnose.predict.candidates import (
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.settings import Settings
-from gyrostab.diagnose.statistics.base import SizeFit, Sizes
+from gyrostab.diagnose.statistics.base import Region, SizeFit, Sizes
 from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, mean_inputs
 from gyrostab.units import HOUR
 
@@ -119,7 +118,7 @@ class RandomProcess(BlockMeanStatistic):
             out[key] = _walk_size(component, fit.state, component.variant)
         return out
 
-    def is_modelled_in(self, region: Mapping[str, Any], *, together: bool) -> bool:
+    def is_modelled_in(self, region: Region, *, together: bool) -> bool:
         """Return whether the baseline contains it: axes that wander together are in no model."""
         return not together
 

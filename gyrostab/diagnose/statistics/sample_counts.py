@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -203,10 +204,10 @@ class SampleCounts(Statistic):
         """Return whether the mismatch is of several axes: anomalous blocks are left out there."""
         return bool(region["view"] == "cross_axis")
 
-    def describe(self, region: Region, when: str) -> str:
-        samples = _COUNT_TEXTS.get(str(region["what"]), "an unusual distribution of its samples")
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
+        samples = _COUNT_TEXTS.get(region["what"], "an unusual distribution of its samples")
         verb = "has" if len(region["axes"]) == 1 else "have"
-        return f"{capitalise_axes(region)} {verb} {samples} {when}"
+        return f"{capitalise_axes(region['axes'])} {verb} {samples} {when}"
 
 
 def _kurtosis_score(excess: Floats, samples: Floats) -> tuple[Floats, Floats]:

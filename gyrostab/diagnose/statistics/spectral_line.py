@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -205,10 +206,10 @@ class SpectralLine(Statistic):
         self, component: Component, region: Region, blocks: xr.Dataset, settings: Settings
     ) -> bool:
         """Return whether a mismatch is at the frequency of the line, or of samples."""
-        if str(region["view"]) not in self.explained_views:
+        if region["view"] not in self.explained_views:
             return False
         if region["view"] == "cross_axis":
-            return str(region["what"]) != "slow"
+            return region["what"] != "slow"
         if component.line_index < 0 or region["view"] == "distribution":
             return True
         lines = blocks["line_frequency"].values
@@ -219,7 +220,7 @@ class SpectralLine(Statistic):
                 <= LEAK_LINES * (lines[1] - lines[0]) + settings.line_width_share * mine
             )
         tau = SINE_TAU_CYCLES / mine  # where the Allan variance of a sine is largest
-        return str(region["what"]).startswith(("avar", "level", "variance")) and bool(
+        return region["what"].startswith(("avar", "level", "variance")) and bool(
             region["tau_min_s"] / settings.line_tau_ratio
             <= tau
             <= region["tau_max_s"] * settings.line_tau_ratio
@@ -236,7 +237,7 @@ class SpectralLine(Statistic):
         tau = SINE_TAU_CYCLES / float(blocks["line_frequency"].values[component.line_index])
         return tau, tau
 
-    def describe(self, region: Region, when: str) -> str:
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
         return (
             f"The spectrum of {axes_text(region['axes'])} has a line at "
             f"{region.get('frequency', np.nan):.5g} Hz {when}, at {region['ratio']:.3g} times the "

@@ -11,7 +11,7 @@ import xarray as xr
 
 from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.diagnose.reduce.block_statistics import pair_indices
-from gyrostab.diagnose.statistics.base import Statistic
+from gyrostab.diagnose.statistics.base import Region, Statistic
 from gyrostab.diagnose.statistics.mismatch_wording import axes_text, length_text, taus_text
 from gyrostab.diagnose.statistics.power import LEVEL_COLUMNS
 from gyrostab.diagnose.statistics.scores import (
@@ -100,18 +100,18 @@ class VarianceFluctuation(Statistic):
         )
 
     def prepare(
-        self, blocks: xr.Dataset, baseline: xr.Dataset, regions: Sequence[Mapping[str, Any]]
+        self, blocks: xr.Dataset, baseline: xr.Dataset, regions: Sequence[Region]
     ) -> xr.Dataset:
         """Scale the powers where the noise level differs: that is reported already."""
         spans = [
-            (str(region["axes"]).split(), float(region["begin"]), float(region["end"]))
+            (region["axes"].split(), float(region["begin"]), float(region["end"]))
             for region in regions
             if region["what"] in LEVEL_COLUMNS
         ]
         return scale_to_expected(blocks, baseline, spans)
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        pace = length_text(float(str(region["what"]).split()[1]))
+        pace = length_text(float(region["what"].split()[1]))
         estimate = region.get("estimate", np.nan)
         size = f" by {100.0 * estimate:.2g} % (rms)" if np.isfinite(estimate) else ""
         return (

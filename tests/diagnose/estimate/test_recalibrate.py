@@ -12,10 +12,10 @@ from gyrostab.diagnose.baseline.calibrate import assemble_baseline, calibrate_ax
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.constant_rate import fit_white_noise
-from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
+from gyrostab.diagnose.identify.forms import choose_forms
 from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
@@ -115,7 +115,7 @@ def test_noise_is_that_of_the_form_in_the_model():
     )
     baseline = calibrate_noise(blocks)
     frame = identify_by_hand(blocks, baseline, "temperature_noise", "power", ("quadratic",))
-    identifications = settle_forms(frame, baseline)
+    identifications = choose_forms(frame, baseline)
     first = fit_identifications(identifications, baseline)
     fit = conclude.refit_with_noise(identifications, baseline, first)
     (size,) = fit.fitted[0].parameters.values()
@@ -132,7 +132,7 @@ def test_noise_belongs_to_the_exponent_in_the_model():
     by_evidence = identify_by_hand(
         blocks, baseline, "ageing_noise", "power", ("growth",), exponent=0.5
     )
-    identifications = settle_forms(by_evidence, baseline)
+    identifications = choose_forms(by_evidence, baseline)
     (component,) = identifications.identified[0].components
     assert component.variant.values["exponent"] == 1.0
     first = fit_identifications(identifications, baseline)

@@ -17,16 +17,16 @@ from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.registry import effects
 
 
-def settle_forms(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
+def choose_forms(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
     """Return identifications with the forms that their models will have.
 
     Each component has a single term where that explains as much, and the exponent that its sizes
     are estimated with. All components of an effect have the same choice of each parameter that is a
-    text. Noise that is calibrated with another
-    form than the model has does not belong to that model.
+    text. Noise that is calibrated with another form than the model has does not belong to that
+    model.
     """
 
-    def settle(identification: Selection) -> Selection:
+    def with_form(identification: Selection) -> Selection:
         state = identifications.state_without(identification, baseline)
         components = _share_choices(identification.components, state)
         return replace(
@@ -39,8 +39,10 @@ def settle_forms(identifications: Identifications, baseline: xr.Dataset) -> Iden
 
     return replace(
         identifications,
-        identified=tuple(settle(identification) for identification in identifications.identified),
-        expected=tuple(settle(identification) for identification in identifications.expected),
+        identified=tuple(
+            with_form(identification) for identification in identifications.identified
+        ),
+        expected=tuple(with_form(identification) for identification in identifications.expected),
     )
 
 
