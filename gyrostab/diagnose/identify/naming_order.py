@@ -252,12 +252,14 @@ def find_pair(
         )
     ]
     companions = {
-        key: _find_beside(examination, keys, components[key], required[key], state) for key in keys
+        key: _find_companions(examination, keys, components[key], required[key], state)
+        for key in keys
     }
     totals = {
-        (first, second): sum_evidence(components[first]) + sum_evidence(components_beside[second])
-        for first, (_, components_beside) in companions.items()
-        for second in components_beside
+        (first, second): sum_evidence(components[first])
+        + sum_evidence(components_with_first[second])
+        for first, (_, components_with_first) in companions.items()
+        for second in components_with_first
     }
     pairs = {
         pair: min(totals[pair], totals[pair[::-1]])
@@ -270,17 +272,20 @@ def find_pair(
     if best is None or pairs[best] <= sum_evidence(alternative):
         return []
     first, second = best
-    with_second, beside_second = companions[second]
-    first_components = beside_second[first]
-    with_first, beside_first = _find_beside(
+    state_with_second, components_with_second = companions[second]
+    first_components = components_with_second[first]
+    state_with_first, components_with_first = _find_companions(
         examination, [second], first_components, required[first], state
     )
-    if second not in beside_first:
+    if second not in components_with_first:
         return []
-    return [(first, first_components, with_second), (second, beside_first[second], with_first)]
+    return [
+        (first, first_components, state_with_second),
+        (second, components_with_first[second], state_with_first),
+    ]
 
 
-def _find_beside(
+def _find_companions(
     examination: Examination,
     keys: Sequence[str],
     components: list[Component],
@@ -291,10 +296,10 @@ def _find_beside(
     chosen = [make_selection(components, required)]
     with_first = condition_on(state, components)
     sought = [candidate for candidate in examination.candidates if candidate.key in keys]
-    components_beside = {}
+    companions = {}
     for key, effect_components in examination.find_components(sought, with_first).items():
         error = form_error(effect_components, chosen, settings=examination.settings)
         physical, _ = keep_physical(effect_components, with_first, error=error)
         if sum_evidence(physical) > examination.threshold + error:
-            components_beside[key] = physical
-    return with_first, components_beside
+            companions[key] = physical
+    return with_first, companions

@@ -29,7 +29,7 @@ from gyrostab.diagnose.result.attribution import active_blocks
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
-from gyrostab.diagnose.statistics.scores import Windows, cube_root_score
+from gyrostab.diagnose.statistics.scores import BlockWindows, cube_root_score
 from gyrostab.noise import NORMAL_95
 
 #: Fits a baseline to the blocks where its argument, a mask, is true.
@@ -234,7 +234,7 @@ def held_out(
             if shown is not after:
                 models["after"] = shown(~held)
             chosen = fold_of_window == number
-            inside = Windows(windows.first[chosen], windows.stop[chosen])
+            inside = BlockWindows(windows.first[chosen], windows.stop[chosen])
             for name, baseline in models.items():
                 squares[name].append(_allan_scores(blocks, baseline, inside))
         nats_by_length.append(length_nats)
@@ -274,7 +274,7 @@ def _compare_models(
     return np.array([nats, variance])
 
 
-def cut_stretches(blocks: xr.Dataset) -> Windows:
+def cut_stretches(blocks: xr.Dataset) -> BlockWindows:
     """Cut a record into the stretches to hold out: 100 s long, shorter in records below an hour."""
     block_count = blocks.sizes["block"]
     span = block_count * float(blocks.attrs["block_s"])
@@ -283,7 +283,7 @@ def cut_stretches(blocks: xr.Dataset) -> Windows:
             0, block_count, min(block_count, max(MIN_STRETCHES, round(span / STRETCH_S))) + 1
         )
     ).astype(np.int64)
-    return Windows(edge[:-1], edge[1:])
+    return BlockWindows(edge[:-1], edge[1:])
 
 
 def log_likelihood(blocks: xr.Dataset, baseline: xr.Dataset, known: Bools, held: Bools) -> float:
@@ -367,7 +367,7 @@ def _mean_evidence(blocks: xr.Dataset, baseline: xr.Dataset, axis: str, used: Bo
     return products_mixture(products, weight - np.logaddexp.reduce(weight)).evidence
 
 
-def _allan_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Floats:
+def _allan_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: BlockWindows) -> Floats:
     """Return squared scores of the Allan variance in disjoint windows of held-out stretches."""
     first, stop = [held.first], [held.stop]
     for length in {1, min(SHORT_WINDOW_BLOCKS, int((held.stop - held.first).min()))}:
@@ -378,7 +378,7 @@ def _allan_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Fl
         start = np.concatenate(inside)
         first.append(start)
         stop.append(start + length)
-    windows = Windows(np.concatenate(first), np.concatenate(stop))
+    windows = BlockWindows(np.concatenate(first), np.concatenate(stop))
     surface = allan_surface(blocks, baseline, windows)
     with np.errstate(divide="ignore", invalid="ignore"):
         z = cube_root_score(surface["observed"] / surface["expected"], surface["shape"])[

@@ -15,7 +15,7 @@ from gyrostab.diagnose.statistics.cross_spectrum import correlation_score
 from gyrostab.diagnose.statistics.mean import slow_coefficients
 from gyrostab.diagnose.statistics.mismatch_wording import capitalise_axes, taus_text
 from gyrostab.diagnose.statistics.scores import (
-    Windows,
+    BlockWindows,
     cube_root_score,
     moving_sum,
     statistic_dataset,
@@ -158,7 +158,7 @@ def _correlate_pairs(
     increments: Floats,
     present: Bools,
     pairs: Pairs,
-    windows: Windows,
+    windows: BlockWindows,
     span: int,
     shared: tuple[Floats, Floats] | None,
 ) -> tuple[Floats, Floats]:

@@ -37,7 +37,7 @@ from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.mismatch_wording import capitalise_axes, taus_text
 from gyrostab.diagnose.statistics.power import with_axis
 from gyrostab.diagnose.statistics.scores import (
-    Windows,
+    BlockWindows,
     cube_root_score,
     statistic_dataset,
     sum_over_windows,
@@ -203,7 +203,7 @@ class CrossSpectrum(Statistic):
 
 @np.errstate(divide="ignore", invalid="ignore")
 def _pair_coherency(
-    blocks: xr.Dataset, baseline: xr.Dataset, left: Ints, right: Ints, windows: Windows
+    blocks: xr.Dataset, baseline: xr.Dataset, left: Ints, right: Ints, windows: BlockWindows
 ) -> tuple[Complexes, Floats]:
     """Compute the coherency and the number of complex frequencies by (record), pair, window, band.
 

@@ -15,7 +15,7 @@ from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
-    Windows,
+    BlockWindows,
     cube_root_score,
     cumulative,
     exponential_score,
@@ -88,7 +88,7 @@ class DriftingLine(Statistic):
         return statistic_dataset(
             blocks,
             rows=axes,
-            windows=Windows(first[parts[:1]], stop[parts[-1:]]),
+            windows=BlockWindows(first[parts[:1]], stop[parts[-1:]]),
             columns=_path_columns(blocks["line_frequency"].values),
             z=z[..., None, :],
             ratio=np.where(path_count > 0, largest, np.nan)[..., None, :],

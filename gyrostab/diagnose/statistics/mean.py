@@ -37,7 +37,7 @@ from gyrostab.diagnose.statistics.jump_forms import (
 )
 from gyrostab.diagnose.statistics.mismatch_wording import axes_text, is_higher
 from gyrostab.diagnose.statistics.scores import (
-    Windows,
+    BlockWindows,
     statistic_dataset,
     sum_over_windows,
     window_set,
@@ -51,7 +51,7 @@ from gyrostab.kernels.regression.boxcars import (
 from gyrostab.kernels.regression.state_space import flicker_states
 from gyrostab.kernels.spectra.expected import interval_variance
 from gyrostab.physics.base import Effect
-from gyrostab.physics.prediction import Windows as PredictionWindows
+from gyrostab.physics.prediction import Windows
 from gyrostab.units import HOUR
 
 #: Lengths of the windows [blocks].
@@ -173,7 +173,7 @@ class Mean(BlockMeanStatistic):
         yield from choose_columns(prospect.values, columns)
 
     def complete_candidate(
-        self, candidate: Candidate, kind: type[Effect], windows: PredictionWindows
+        self, candidate: Candidate, kind: type[Effect], windows: Windows
     ) -> Candidate:
         """Let a step at a given time occur at every restart."""
         return replace(candidate, variants=_with_steps_at_restarts(candidate.variants, windows))
@@ -224,9 +224,7 @@ def mean_inputs(trial: Trial, axis: str) -> list[Floats | None]:
     ]
 
 
-def _with_steps_at_restarts(
-    variants: tuple[Variant, ...], windows: PredictionWindows
-) -> tuple[Variant, ...]:
+def _with_steps_at_restarts(variants: tuple[Variant, ...], windows: Windows) -> tuple[Variant, ...]:
     """Add a variant in which the level changes at every restart, each time by another size.
 
     A single step leaves the others, which free random walk explains as well as that step. With all
@@ -260,7 +258,7 @@ def _with_steps_at_restarts(
 
 
 def window_means(
-    blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
+    blocks: xr.Dataset, baseline: xr.Dataset, windows: BlockWindows
 ) -> tuple[Floats, Floats]:
     """Compute matched filter and information of every window; their ratio is the constant in it.
 
@@ -277,7 +275,9 @@ def window_means(
     return amount, information
 
 
-def _matched_filter(residual: Floats, noise: MeanNoise, windows: Windows) -> tuple[Floats, Floats]:
+def _matched_filter(
+    residual: Floats, noise: MeanNoise, windows: BlockWindows
+) -> tuple[Floats, Floats]:
     """Return filter output and information of each window, both independent of a constant."""
     weighted = apply_precision(residual, noise)
     weighted_ones = apply_precision(np.ones(residual.shape[-1]), noise)

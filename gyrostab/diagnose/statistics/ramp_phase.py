@@ -25,7 +25,7 @@ from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.diagnose.statistics.rotation_order import score_orders, turns_per_second
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
-    Windows,
+    BlockWindows,
     cube_root_score,
     statistic_dataset,
     sum_over_windows,
@@ -166,7 +166,7 @@ class RampPhase(Statistic):
 
 
 def _score_profile(
-    blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
+    blocks: xr.Dataset, baseline: xr.Dataset, windows: BlockWindows
 ) -> tuple[Floats, ...]:
     """Return score, ratio and rms of the mean by phase, by (record), axis, window, 1."""
     profile = blocks["profile"].values

@@ -24,10 +24,10 @@ from gyrostab.diagnose.predict.linear_model import (
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.reduce.block_statistics import noise_at_orders
 from gyrostab.diagnose.statistics.base import NullDraw, SizeFit, Sizes, Statistic
-from gyrostab.diagnose.statistics.scores import Windows, exponential_score, sum_over_windows
+from gyrostab.diagnose.statistics.scores import BlockWindows, exponential_score, sum_over_windows
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.base import Effect
-from gyrostab.physics.prediction import Windows as EffectWindows
+from gyrostab.physics.prediction import Windows
 
 EARTH_RATE = 15.041067  # deg/h: 360 degrees in a sidereal day of 23.934470 h
 
@@ -78,7 +78,7 @@ class RotationOrder(Statistic):
             yield Variant(prospect.values, (name,), pattern[None, :, :count])
 
     def complete_candidate(
-        self, candidate: Candidate, kind: type[Effect], windows: EffectWindows
+        self, candidate: Candidate, kind: type[Effect], windows: Windows
     ) -> Candidate:
         """Give all axes one size unless the effect has several."""
         many = {item.name for item in kind.parameters() if item.many}
@@ -275,7 +275,9 @@ def turns_per_second(blocks: xr.Dataset) -> Array:
     return np.asarray(np.nan_to_num(np.abs(blocks["channel_rotation_rate"].values) / 360.0))
 
 
-def score_orders(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
+def score_orders(
+    blocks: xr.Dataset, baseline: xr.Dataset, windows: BlockWindows
+) -> tuple[Array, ...]:
     """Return score, ratio and amplitude of the coherent sum by (record), axis, window, harmonic."""
     order = blocks["order"].values
     samples = blocks["order_samples"].values

@@ -40,7 +40,7 @@ from gyrostab.diagnose.statistics.base import Region, SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
-    Windows,
+    BlockWindows,
     cube_root_score,
     cumulative,
     moving_sum,
@@ -257,7 +257,7 @@ def explained_lines(state: State) -> Bools:
     )
 
 
-def _equal_block_share(blocks: xr.Dataset, windows: Windows) -> Floats:
+def _equal_block_share(blocks: xr.Dataset, windows: BlockWindows) -> Floats:
     """Return the equivalent share of equal-power blocks in a mean, by window and line."""
     power, shape = (blocks[name].values for name in ("power", "shape"))
     present = np.isfinite(power) & (shape > 0)

@@ -15,7 +15,7 @@ from gyrostab.diagnose.statistics.base import Region, Statistic
 from gyrostab.diagnose.statistics.mismatch_wording import axes_text, length_text, taus_text
 from gyrostab.diagnose.statistics.power import LEVEL_COLUMNS
 from gyrostab.diagnose.statistics.scores import (
-    Windows,
+    BlockWindows,
     cube_root_score,
     statistic_dataset,
     sum_over_windows,
@@ -268,7 +268,7 @@ def _median_over_blocks(values: Floats) -> Floats:
 
 @np.errstate(divide="ignore", invalid="ignore")
 def _score_scatter(
-    level: Floats, weight: Floats, windows: Windows, span: int, *, single: int
+    level: Floats, weight: Floats, windows: BlockWindows, span: int, *, single: int
 ) -> tuple[Floats, Floats, Floats]:
     """Return score, ratio and variation by (record), row, window, column, for `span` blocks.
 
@@ -288,7 +288,7 @@ def _score_scatter(
     average = np.where(present, average, 0.0)
     # An incomplete average at the end of the record does not count.
     begin = np.minimum(-(-windows.first // span), count)
-    inside = Windows(begin, np.maximum(windows.stop // span, begin))
+    inside = BlockWindows(begin, np.maximum(windows.stop // span, begin))
     first = sum_over_windows(total * average, inside)
     square = sum_over_windows(total * average**2, inside)
     number = sum_over_windows(present.astype(float), inside)
