@@ -131,7 +131,7 @@ def _take_region(
         "statistic": statistic.name,
         "view": statistic.view,
         "axes": str(scores["axes"].values[row]),
-        "what": str(scores["what"].values[column]),
+        "quantity": str(scores["quantity"].values[column]),
         "begin": begin,
         "end": end,
         "tau_min_s": float(scores["tau_min_s"].values[columns].min()),
@@ -231,7 +231,7 @@ def _find_columns(
     settings: Settings,
 ) -> tuple[Ints, Ints]:
     """Return the columns of a region, and those that it explains."""
-    kinds, low, high = (scores[name].values for name in ("what", "tau_min_s", "tau_max_s"))
+    kinds, low, high = (scores[name].values for name in ("quantity", "tau_min_s", "tau_max_s"))
     above = np.nan_to_num(combined) > settings.clear_sigma
     if kinds[column] == "level":  # of all averaging times: the region has those above the noise
         avar_columns = np.flatnonzero(above & (kinds == "avar"))
@@ -261,7 +261,7 @@ def merge_regions(regions: Sequence[Region], *, settings: Settings = DEFAULTS) -
 
     Examples
     --------
-    >>> region = {"statistic": "power", "view": "davar", "axes": "x", "what": "avar",
+    >>> region = {"statistic": "power", "view": "davar", "axes": "x", "quantity": "avar",
     ...           "begin": 0.0, "end": 60.0, "tau_min_s": 0.01, "tau_max_s": 0.1,
     ...           "frequency": float("nan"), "sign": 1, "z": 9.0, "p_value": 1e-6}
     >>> on_y = region | {"axes": "y", "z": 8.0}
@@ -290,9 +290,9 @@ def _are_alike(region: Region, other: Region, settings: Settings) -> bool:
         region["sign"] != other["sign"] and region["view"] != "cross_axis"
     ):
         return False
-    if region["what"] == "line" or other["what"] == "line":
+    if region["quantity"] == "line" or other["quantity"] == "line":
         return bool(
-            region["what"] == other["what"]
+            region["quantity"] == other["quantity"]
             and abs(region["frequency"] / other["frequency"] - 1.0) < settings.line_width_share
         )
     if _kind_of(region) != _kind_of(other):
@@ -305,7 +305,7 @@ def _are_alike(region: Region, other: Region, settings: Settings) -> bool:
 
 def _kind_of(region: Region) -> str:
     """Return the kind of a region; regions of different kinds are not merged."""
-    kind = region["what"].split(" ")[0]
+    kind = region["quantity"].split(" ")[0]
     return kind if kind in _SEPARATE_KINDS else ""
 
 
@@ -335,7 +335,7 @@ def _extend_region(region: Region, other: Region, settings: Settings) -> None:
             min(region["begin"], other["begin"]),
             max(region["end"], other["end"]),
         )
-        if region["what"] != "line":
+        if region["quantity"] != "line":
             low = min(region["tau_min_s"], other["tau_min_s"])
             high = max(region["tau_max_s"], other["tau_max_s"])
             region["tau_min_s"], region["tau_max_s"] = low, high

@@ -200,7 +200,7 @@ def _components_at(
     common = set(region["axes"].split()) & set(effect.identification.axes)
     if not components or not common:
         return []
-    together = region["what"] == "slow" and len(common) > 1
+    together = region["quantity"] == "slow" and len(common) > 1
     if is_left and all(
         component.statistic.is_modelled_in(region, together=together) for component in components
     ):
@@ -401,7 +401,7 @@ def _score_left(
     for name, statistic, z in scores:
         if (
             find_statistic(name).view != region["view"]
-            or region["what"] not in statistic["what"].values
+            or region["quantity"] not in statistic["quantity"].values
         ):
             continue
         rows = [
@@ -412,7 +412,7 @@ def _score_left(
         inside = (statistic["begin"].values >= region["begin"] - 1e-6) & (
             statistic["end"].values <= region["end"] + 1e-6
         )
-        columns = (statistic["what"].values == region["what"]) & (
+        columns = (statistic["quantity"].values == region["quantity"]) & (
             statistic["tau_min_s"].values >= 0.99 * region["tau_min_s"]
         )
         columns &= statistic["tau_min_s"].values <= 1.01 * region["tau_max_s"]

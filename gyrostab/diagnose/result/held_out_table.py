@@ -382,7 +382,7 @@ def _allan_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: BlockWindows) 
     surface = allan_surface(blocks, baseline, windows)
     with np.errstate(divide="ignore", invalid="ignore"):
         z = cube_root_score(surface["observed"] / surface["expected"], surface["shape"])[
-            ..., surface["columns"]["what"] == "avar"
+            ..., surface["columns"]["quantity"] == "avar"
         ]
     return np.asarray(z[np.isfinite(z)] ** 2)
 

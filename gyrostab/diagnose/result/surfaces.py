@@ -48,7 +48,9 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
     windows = _make_windows(blocks.sizes["block"])
     plain = before.assign(known_mean=before["known_mean"] * 0.0)
     recorded = allan_surface(blocks, plain, windows)
-    keep = (recorded["columns"]["what"] == "avar") & np.isfinite(recorded["shape"]).any(axis=(0, 1))
+    keep = (recorded["columns"]["quantity"] == "avar") & np.isfinite(recorded["shape"]).any(
+        axis=(0, 1)
+    )
     avar = [recorded["observed"][..., keep]]
     low, high = ([np.full(avar[0].shape, np.nan)] for _ in range(2))
     mean = [_average_windows(blocks, blocks["mean"].values, windows)]

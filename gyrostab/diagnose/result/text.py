@@ -95,9 +95,9 @@ def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
 
     Examples
     --------
-    >>> mismatch_statement({"statistic": "power", "what": "avar", "axes": ["x"], "begin": 1500.0,
-    ...                     "end": 1800.0, "tau_min_s": 0.01, "tau_max_s": 3.0, "ratio": 1.8,
-    ...                     "sign": 1, "p_value": 0.0004, "estimate": 1.8}, 3600.0)
+    >>> mismatch_statement({"statistic": "power", "quantity": "avar", "axes": ["x"],
+    ...                     "begin": 1500.0, "end": 1800.0, "tau_min_s": 0.01, "tau_max_s": 3.0,
+    ...                     "ratio": 1.8, "sign": 1, "p_value": 0.0004, "estimate": 1.8}, 3600.0)
     'Axis x is noisier than the simulation from 25:00 to 30:00 after the start: at averaging times
      of 10 ms to 3 s its Allan variance is 1.8 times the expected value (noise alone would show
      this in 1 of 2 500 such records).'

@@ -103,7 +103,7 @@ def _surface_within_blocks(
         "expected": expected / count,
         "shape": gamma,
         "columns": {
-            "what": np.array(["avar"] * k.size + ["level"], dtype="<U8"),
+            "quantity": np.array(["avar"] * k.size + ["level"], dtype="<U8"),
             "tau_min_s": np.append(k / rate, 1.0 / rate),
             "tau_max_s": np.append(k / rate, k[-1] / rate),
         },
@@ -140,7 +140,7 @@ def _surface_of_means(
     }
     tau = np.array(sizes, dtype=float) * block
     joined["columns"] = {
-        "what": np.array(["avar"] * tau.size, dtype="<U8"),
+        "quantity": np.array(["avar"] * tau.size, dtype="<U8"),
         "tau_min_s": tau,
         "tau_max_s": tau,
     }

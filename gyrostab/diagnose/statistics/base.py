@@ -39,7 +39,7 @@ class Region(TypedDict):
     statistic: str  # name
     view: str
     axes: str  # separated by blanks
-    what: str  # which of the columns of the scores
+    quantity: str  # that is scored, such as "avar", "level", "line" or "outliers"
     begin: float  # s since the start
     end: float
     tau_min_s: float

@@ -90,7 +90,7 @@ class CommonMode(Statistic):
             rows=rows,
             windows=windows,
             columns={
-                "what": "slow",
+                "quantity": "slow",
                 "tau_min_s": block * np.array(spans, dtype=float),
                 "tau_max_s": block * block_count / 2.0,
             },

@@ -109,7 +109,7 @@ class CrossSpectrum(Statistic):
             rows=rows,
             windows=windows,
             columns={
-                "what": np.repeat(
+                "quantity": np.repeat(
                     ["in phase", "all in phase", "in quadrature", "all in quadrature"],
                     [bands, 1, bands, 1],
                 ),

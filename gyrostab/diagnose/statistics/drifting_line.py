@@ -96,7 +96,7 @@ class DriftingLine(Statistic):
         )
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        first, last = region["what"].split()[1:]
+        first, last = region["quantity"].split()[1:]
         return (
             f"The spectrum of {axes_text(region['axes'])} has a drifting line {when}, from about "
             f"{first} Hz to about {last} Hz"
@@ -181,7 +181,7 @@ def _path_columns(frequency: Floats) -> dict[str, Any]:
     middle = (edges[1:] + edges[:-1]) / 2.0
     begin_section, end_section = np.divmod(np.arange(_SPECTRUM_SECTIONS**2), _SPECTRUM_SECTIONS)
     return {
-        "what": [
+        "quantity": [
             f"drifting {middle[a]:.3g} {middle[b]:.3g}"
             for a, b in zip(begin_section, end_section, strict=True)
         ],

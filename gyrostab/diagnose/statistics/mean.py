@@ -102,7 +102,7 @@ class BlockMeanStatistic(Statistic):
         self, component: Component, region: Region, blocks: xr.Dataset, settings: Settings
     ) -> bool:
         """Return whether the mismatch is one of means; of several axes only a slow one."""
-        is_slow = region["view"] != "cross_axis" or region["what"] == "slow"
+        is_slow = region["view"] != "cross_axis" or region["quantity"] == "slow"
         return region["view"] in self.explained_views and bool(is_slow)
 
     def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
@@ -152,7 +152,7 @@ class Mean(BlockMeanStatistic):
             blocks,
             windows=windows,
             columns={
-                "what": "mean",
+                "quantity": "mean",
                 "tau_min_s": [block],
                 "tau_max_s": [block * max(windows.length, default=1)],
             },

@@ -97,7 +97,7 @@ class RampPhase(Statistic):
         return statistic_dataset(
             blocks,
             windows=windows,
-            columns={"what": kinds, "tau_min_s": tau_min, "tau_max_s": tau_max},
+            columns={"quantity": kinds, "tau_min_s": tau_min, "tau_max_s": tau_max},
             z=z,
             ratio=ratio,
             estimate=estimate,
@@ -153,7 +153,7 @@ class RampPhase(Statistic):
         return out, [], []
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        kind = region["what"]
+        kind = region["quantity"]
         component = (
             f"The rate of {axes_text(region['axes'])} has a component of "
             f"{region['estimate']:.3g} deg/h"

@@ -57,7 +57,7 @@ class Restart(Statistic):
         return statistic_dataset(
             blocks,
             windows=windows,
-            columns={"what": kinds, "tau_min_s": block, "tau_max_s": tau},
+            columns={"quantity": kinds, "tau_min_s": block, "tau_max_s": tau},
             z=scores,
             ratio=np.abs(scores),
             estimate=size,

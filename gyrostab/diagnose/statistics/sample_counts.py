@@ -132,7 +132,7 @@ class SampleCounts(Statistic):
             blocks,
             windows=windows,
             columns={
-                "what": [*SCORED_COUNTS, "kurtosis"],
+                "quantity": [*SCORED_COUNTS, "kurtosis"],
                 "tau_min_s": 1.0 / rate,
                 "tau_max_s": 1.0 / rate,
                 "floor": _MIN_SCATTER,
@@ -205,7 +205,7 @@ class SampleCounts(Statistic):
         return bool(region["view"] == "cross_axis")
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        samples = _COUNT_TEXTS.get(region["what"], "an unusual distribution of its samples")
+        samples = _COUNT_TEXTS.get(region["quantity"], "an unusual distribution of its samples")
         verb = "has" if len(region["axes"]) == 1 else "have"
         return f"{capitalise_axes(region['axes'])} {verb} {samples} {when}"
 

@@ -138,7 +138,7 @@ def statistic_dataset(
     """Assemble the results of a statistic by (record), row, window, tau.
 
     These are its near-normal score ``z``, the ``ratio`` of observed over expected, and perhaps an
-    ``estimate``, the size of the mismatch. Columns have ``what`` (str), ``tau_min_s``,
+    ``estimate``, the size of the mismatch. Columns have ``quantity`` (str), ``tau_min_s``,
     ``tau_max_s`` [s], ``frequency`` [Hz] and ``floor``, the smallest standard deviation that null
     records may give a score. The rows are axes, separated by blanks; by default each axis of the
     record. Only an excess is a mismatch in a one-sided statistic.

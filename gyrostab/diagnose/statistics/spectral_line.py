@@ -96,7 +96,12 @@ class SpectralLine(Statistic):
         return statistic_dataset(
             blocks,
             windows=windows,
-            columns={"what": "line", "tau_min_s": half, "tau_max_s": half, "frequency": frequency},
+            columns={
+                "quantity": "line",
+                "tau_min_s": half,
+                "tau_max_s": half,
+                "frequency": frequency,
+            },
             z=z,
             ratio=ratio,
             estimate=2.0 * np.sqrt(np.maximum(excess, 0.0) / float(blocks.attrs["block_s"])),
@@ -209,7 +214,7 @@ class SpectralLine(Statistic):
         if region["view"] not in self.explained_views:
             return False
         if region["view"] == "cross_axis":
-            return region["what"] != "slow"
+            return region["quantity"] != "slow"
         if component.line_index < 0 or region["view"] == "distribution":
             return True
         lines = blocks["line_frequency"].values
@@ -220,7 +225,7 @@ class SpectralLine(Statistic):
                 <= LEAK_LINES * (lines[1] - lines[0]) + settings.line_width_share * mine
             )
         tau = SINE_TAU_CYCLES / mine  # where the Allan variance of a sine is largest
-        return region["what"].startswith(("avar", "level", "variance")) and bool(
+        return region["quantity"].startswith(("avar", "level", "variance")) and bool(
             region["tau_min_s"] / settings.line_tau_ratio
             <= tau
             <= region["tau_max_s"] * settings.line_tau_ratio

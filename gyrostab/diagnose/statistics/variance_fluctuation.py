@@ -89,7 +89,9 @@ class VarianceFluctuation(Statistic):
             rows=rows,
             windows=windows,
             columns={
-                "what": np.repeat([f"variance {span * block:g} s" for span in spans], f_low.size),
+                "quantity": np.repeat(
+                    [f"variance {span * block:g} s" for span in spans], f_low.size
+                ),
                 "tau_min_s": np.tile(0.5 / f_high, len(spans)),
                 "tau_max_s": np.tile(0.5 / f_low, len(spans)),
             },
@@ -106,12 +108,12 @@ class VarianceFluctuation(Statistic):
         spans = [
             (region["axes"].split(), float(region["begin"]), float(region["end"]))
             for region in regions
-            if region["what"] in LEVEL_COLUMNS
+            if region["quantity"] in LEVEL_COLUMNS
         ]
         return scale_to_expected(blocks, baseline, spans)
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        pace = length_text(float(region["what"].split()[1]))
+        pace = length_text(float(region["quantity"].split()[1]))
         estimate = region.get("estimate", np.nan)
         size = f" by {100.0 * estimate:.2g} % (rms)" if np.isfinite(estimate) else ""
         return (

@@ -158,14 +158,14 @@ def test_jump_explains_the_mean_on_either_side(shaken, step, attributed):
         "statistic": "mean",
         "view": "mean",
         "axes": "x",
-        "what": "mean",
+        "quantity": "mean",
         "begin": 1200.0,
         "end": 1800.0,
         "tau_min_s": 20.0,
         "tau_max_s": 600.0,
     }
     region |= {"frequency": np.nan, "sign": -1, "z": -8.0}
-    assert find_statistic("mean").score(moved, baseline)["what"].values.tolist() == ["mean"]
+    assert find_statistic("mean").score(moved, baseline)["quantity"].values.tolist() == ["mean"]
 
     def explained(**options):
         return attribute_mismatches(
@@ -185,7 +185,7 @@ def test_jump_explains_the_mean_on_either_side(shaken, step, attributed):
     )
 
 
-BOX = {"view": "davar", "axes": "x", "what": "level", "z": 20.0}
+BOX = {"view": "davar", "axes": "x", "quantity": "level", "z": 20.0}
 
 
 def _make_shown(*statistics):
@@ -250,7 +250,7 @@ def test_short_mismatch_is_merged_only_with_a_near_long_one(begin, regions):
         "statistic": "power",
         "view": "davar",
         "axes": "x y",
-        "what": "level",
+        "quantity": "level",
         "begin": 100.0,
         "end": 400.0,
         "tau_min_s": 0.01,

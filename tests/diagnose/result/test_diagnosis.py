@@ -441,7 +441,7 @@ def test_every_effect_has_a_plain_name_and_a_next_measurement():
 @pytest.mark.parametrize("axes", [["x"], ["x", "y"]])
 def test_every_statistic_has_a_sentence(statistic: str, detail: str, axes: list[str]):
     region = {
-        "statistic": statistic, "what": detail, "axes": axes, "begin": 0.0, "end": 3600.0,
+        "statistic": statistic, "quantity": detail, "axes": axes, "begin": 0.0, "end": 3600.0,
         "tau_min_s": 0.01, "tau_max_s": 0.01, "ratio": 2.0,
         "sign": -1, "p_value": 0.002, "estimate": -0.2, "frequency": 13.0,
     }  # fmt: skip

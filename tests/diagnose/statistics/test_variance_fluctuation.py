@@ -151,11 +151,11 @@ def test_a_burst_with_a_region_is_not_reported_again(base, null):
     blocks = _some_records(base, 1, 9).isel(record=0)
     blocks["power"][0, 60:75] *= 1.7
     regions = locate_mismatches(blocks, base, null)
-    what = [region["what"] for region in regions]
+    what = [region["quantity"] for region in regions]
     assert what == ["level"] or set(what) == {"avar"}
     blocks["power"][1] *= np.exp(0.5 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 9.0))[:, None]
     regions = locate_mismatches(blocks, base, null)
-    new = [region for region in regions if region["what"].startswith("variance")]
+    new = [region for region in regions if region["quantity"].startswith("variance")]
     assert "y" in {axis for region in new for axis in region["axes"].split()}
     begin, end = min(region["begin"] for region in new), max(region["end"] for region in new)
     assert end - begin > 0.9 * BLOCKS * 20.0
@@ -200,7 +200,7 @@ def test_a_drifting_line_is_detected_along_its_path(base, null, first, last, ben
         _largest_score(find_statistic("drifting_line"), blocks, base, null) > critical
     ).mean() > 0.5
     scores = find_statistic("drifting_line").score(blocks, base)
-    best = scores["what"].values[
+    best = scores["quantity"].values[
         np.bincount(
             standardise(scores, null.statistics["drifting_line"])[:, 1, 0].argmax(axis=1)
         ).argmax()
@@ -259,7 +259,7 @@ def test_windows_after_the_last_average_have_no_score(block_count):
     )
     behind = (scores["first"] > block_count // 32 * 32).values
     assert behind.any()
-    long = np.char.startswith(scores["what"].values.astype(str), "variance 640 s")
+    long = np.char.startswith(scores["quantity"].values.astype(str), "variance 640 s")
     assert long.any()
     assert np.isnan(scores["z"].values[..., behind, :][..., long]).all()
     whole = (scores["stop"] - scores["first"] == block_count).values
@@ -291,20 +291,20 @@ def test_a_level_and_its_scatter_are_two_mismatches():
         "statistic": "variance_fluctuation",
         "view": "davar",
         "axes": "x",
-        "what": "avar",
+        "quantity": "avar",
         "begin": 0.0,
         "end": 100.0,
         "tau_min_s": 0.01,
         "tau_max_s": 0.1,
     }
     region |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
-    assert len(merge_regions([region, region | {"what": "variance 20 s"}])) == 2
+    assert len(merge_regions([region, region | {"quantity": "variance 20 s"}])) == 2
     assert (
         len(
             merge_regions(
                 [
-                    region | {"what": "variance 40 s"},
-                    region | {"what": "variance 20 s", "axes": "x y"},
+                    region | {"quantity": "variance 40 s"},
+                    region | {"quantity": "variance 20 s", "axes": "x y"},
                 ]
             )
         )
@@ -316,7 +316,7 @@ def test_statements_give_time_scale_and_frequencies():
     region = {
         "statistic": "variance_fluctuation",
         "view": "davar",
-        "what": "variance 40 s",
+        "quantity": "variance 40 s",
         "axes": ["x", "y"],
         "begin": 0.0,
         "end": 2000.0,
@@ -328,7 +328,7 @@ def test_statements_give_time_scale_and_frequencies():
     assert "axes x and y fluctuates over the whole record" in statement
     assert "one stretch of 40 s to another" in statement
     assert "8 % (rms)" in statement
-    glide = region | {"statistic": "drifting_line", "what": "drifting 1.58 3.42", "axes": ["y"]}
+    glide = region | {"statistic": "drifting_line", "quantity": "drifting 1.58 3.42", "axes": ["y"]}
     assert (
         "a drifting line over the whole record, from about 1.58 Hz to about 3.42 Hz"
         in mismatch_statement(glide, 2000.0)
