@@ -21,7 +21,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import OptimizeResult
 
 from gyrostab.arrays import Bools, Floats, Ints
-from gyrostab.diagnose.baseline.axis_means import AxisMeans, find_peaks
+from gyrostab.diagnose.baseline.axis_means import AxisMeans, maximise_likelihood
 from gyrostab.diagnose.baseline.expected_statistics import reduced_shape
 from gyrostab.diagnose.baseline.posterior import (
     Fit,
@@ -152,9 +152,9 @@ class _AxisRecord:
         """Return the most likely of several points, (parameter,)."""
         return np.asarray(points[self.negative_likelihood(points).argmin()])
 
-    def find_peaks(self, starts: Sequence[Floats]) -> list[OptimizeResult]:
+    def maximise_likelihood(self, starts: Sequence[Floats]) -> list[OptimizeResult]:
         """Find the largest likelihood from several starts; the best first."""
-        return find_peaks(self.negative_likelihood, starts, self.ends[: starts[0].size])
+        return maximise_likelihood(self.negative_likelihood, starts, self.ends[: starts[0].size])
 
     def measure_evidence(self, peak: OptimizeResult) -> tuple[float, Floats]:
         """Return the evidence by Laplace's approximation, and the covariance of the parameters."""
@@ -191,16 +191,18 @@ def find_correlated_bias(state: State, axis: str) -> CorrelatedBias | None:
     if record is None:
         return None
     K, B, sizes, times = record.start_grid()
-    without = record.find_peaks([record.find_best(_combine_values([k], B)) for k in K[::2]])
+    without = record.maximise_likelihood(
+        [record.find_best(_combine_values([k], B)) for k in K[::2]]
+    )
     # next to a bias, K and B are each about as large as without it, or much smaller
     smaller = np.maximum(without[0].x - math.log(_SMALLER), record.ends[:2, 0])
     noise = _combine_values(*np.column_stack([without[0].x, smaller]))
-    with_bias = record.find_peaks(
+    with_bias = record.maximise_likelihood(
         [record.find_best(_combine_values(*slow[:, None], sizes, times)) for slow in noise]
     )
     record = record.with_scatter_about(with_bias[0].x)
     without, with_bias = (
-        record.find_peaks([peak.x for peak in peaks]) for peaks in (without, with_bias)
+        record.maximise_likelihood([peak.x for peak in peaks]) for peaks in (without, with_bias)
     )
     evidence, covariance = record.measure_evidence(with_bias[0])
     to_rms = np.array([[1.0, -0.5], [0.0, 1.0]])
@@ -223,8 +225,8 @@ def fit_rms(state: State, axis: str, time: float) -> float | None:
     record = replace(record, ends=np.vstack([record.ends[:-1], [log_time, log_time]]))
     K, B, sizes, _ = record.start_grid()
     start = record.find_best(_combine_values(K[::2], B[::2], sizes, [log_time]))
-    point = record.find_peaks([start])[0].x
-    return _rms_and_time(record.with_scatter_about(point).find_peaks([point])[0])[0]
+    point = record.maximise_likelihood([start])[0].x
+    return _rms_and_time(record.with_scatter_about(point).maximise_likelihood([point])[0])[0]
 
 
 def _rms_and_time(peak: OptimizeResult) -> tuple[float, float]:

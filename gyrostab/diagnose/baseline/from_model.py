@@ -99,7 +99,7 @@ def baseline_from_model(
     )
     out["mean_variance"] *= effects.white_share
     out = out.assign(label_variables(effects.variables, BASELINE))
-    if "line_noise" in out or "peaks" in out:
+    if "line_noise" in out or "broad_peaks" in out:
         _describe_lines(out, blocks, squares)
     out["coefficient"].loc[{"term": "R"}] = ramp
     out["stderr"].loc[{"term": list(TERMS) if given_blocks is None else ["R"]}] = 0.0
@@ -127,8 +127,8 @@ def _describe_lines(baseline: xr.Dataset, blocks: xr.Dataset, square: Floats) ->
             blocks["frequency"].values,
         )
         baseline["line_shape"] = baseline["line_noise"].copy(data=density / smooth)
-    if "peaks" in baseline:
-        share = independent_line_share(density + baseline["peaks"].values, blocks)
+    if "broad_peaks" in baseline:
+        share = independent_line_share(density + baseline["broad_peaks"].values, blocks)
         if "line_noise" in baseline:  # the blocks have the share of the filter
             share = share / independent_line_share(density, blocks)
         baseline["shape_alone"] *= share[:, None]

@@ -205,6 +205,6 @@ def _line_statistics(
     return {
         "lines": lines,
         "lines_most": largest,
-        "peaks": peaks,
+        "broad_peaks": peaks,
         "line_spectrum": in_bands * unspread_share(blocks).mean(axis=1)[:, None],
     }

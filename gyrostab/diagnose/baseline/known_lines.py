@@ -67,7 +67,12 @@ def expect_lines(
             for row, power in zip(rows, size * passed[rows], strict=True):
                 (steady if is_line else broad)[row] += np.convolve(power, own_leak, "same")
                 largest[row] += np.convolve(power, largest_leak, "same") if is_line else 0.0
-    return {"lines": steady, "lines_most": largest, "peaks": broad, "line_spectrum": band_power}
+    return {
+        "lines": steady,
+        "lines_most": largest,
+        "broad_peaks": broad,
+        "line_spectrum": band_power,
+    }
 
 
 def resonance_density(
@@ -190,8 +195,8 @@ def remove_known_lines(
         4.0 * step * _take_leakage(lines).sum(axis=-1) for lines in without_gaps
     )
     exceeds = square - largest_square > error * largest_square + settings.clear_sigma * stderr
-    peaks = _take_leakage(baseline["peaks"].values).sum(axis=-1)
-    in_peak = peaks > error * noise[:, 0]
+    broad = _take_leakage(baseline["broad_peaks"].values).sum(axis=-1)
+    in_peak = broad > error * noise[:, 0]
     new = (exceeds | (largest_square == 0.0)) & ~in_peak
     return blocks.assign(
         line_power=power.copy(data=np.where(np.isfinite(power.values), freed, np.nan)),

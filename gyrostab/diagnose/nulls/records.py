@@ -138,8 +138,8 @@ def _prepare_nulls(
     for total in density.sum(axis=-1):
         variances = total.mean() * rate, 2.0 * ((total * half_difference).mean() * rate)
         sd.append(np.sqrt(variances))
-    if "peaks" in baseline:
-        density = np.concatenate([density, baseline["peaks"].values[..., None]], axis=-1)
+    if "broad_peaks" in baseline:
+        density = np.concatenate([density, baseline["broad_peaks"].values[..., None]], axis=-1)
     tails = np.array([_kurtosis_excess(blocks, axis_density, rng) for axis_density in density])
     ties = _common_shapes(baseline["shape_alone"].values, int(blocks.attrs["block_samples"]))
     shared = _find_shared_noise(blocks, baseline)
@@ -349,8 +349,8 @@ def _draw_lines(setup: _NullSetup, squares: Floats, rng: np.random.Generator) ->
         if "line_shape" in baseline:
             effects = effects * baseline["line_shape"].values[axis]
         out[:, axis, part] = (share * plain[:, axis] + (1.0 - share) * flat[:, axis]) * effects
-        if "peaks" in baseline:
-            out[:, axis, part] += baseline["peaks"].values[axis]
+        if "broad_peaks" in baseline:
+            out[:, axis, part] += baseline["broad_peaks"].values[axis]
     for record in out:  # one after the other: they may have many lines
         drawn = _draw_gamma(weight[..., None], np.ones(record.shape), rng)
         record *= _correlate_lines(drawn, int(blocks.attrs["block_samples"]))

@@ -43,7 +43,7 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     enough = present >= max(MIN_MEAN_SHARE * work.length, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         kurtosis = moments[..., 2] / moments[..., 1] ** 2 - 3.0
-    peaks, outliers = count_outliers(by_name["histogram"], work.peaks)
+    outlier_count, outliers = count_outliers(by_name["histogram"], work.peaks)
     subset, at_once = np.array(list(work.at_once), np.bool_), np.stack(list(work.at_once.values()))
     filled = zeros_beyond_chance(by_name["common_zeros"], counts[..., 1], present, subset, at_once)
     samples = np.stack(work.kept_samples, axis=1)  # (axis, block, sample)
@@ -76,7 +76,7 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
         "samples": present,
         "power": by_name["power"][axes],
         "kurtosis": np.where(np.isnan(by_name["neighbours"]), np.nan, kurtosis),
-        "peaks": peaks,
+        "outlier_count": outlier_count,
         "outliers": outliers,
         "repeats": repeats + resent[..., 0],
         "repeat_runs": counts[..., 7] + resent[..., 1],

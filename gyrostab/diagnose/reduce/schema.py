@@ -42,9 +42,11 @@ BLOCK_STATISTICS: dict[str, Variable] = {
     "shape": Variable(_BAND, "1", "shape of the gamma distribution of the power in white noise"),
     "neighbours": Variable(_BLOCK, "1", "share of neighbouring pairs of samples, tapered"),
     "kurtosis": Variable(_BLOCK, "1", "excess kurtosis of the block"),
-    "peaks": Variable(_BLOCK, "1", "isolated outliers"),
+    "outlier_count": Variable(_BLOCK, "1", "isolated outliers"),
     "outliers": Variable(
-        _BLOCK, "1", "isolated outliers, three times those beyond twice the limit"
+        _BLOCK,
+        "1",
+        "isolated outliers; one beyond twice the limit counts three times, see `outlier_count`",
     ),
     "adjacent": Variable(_BLOCK, "1", "samples with another one right before them in the block"),
     "repeats": Variable(
@@ -204,7 +206,7 @@ BASELINE: dict[str, Variable] = {
     "form_shape": Variable(("axis", "band"), "1", "shape of the distribution of the form"),
     "lines": Variable(_LINE, _POWER, "expected power of steady lines without gaps"),
     "lines_most": Variable(_LINE, _POWER, "largest power of them at any offset of the frequency"),
-    "peaks": Variable(_LINE, _POWER, "expected power of broad peaks"),
+    "broad_peaks": Variable(_LINE, _POWER, "expected power of broad peaks"),
     "line_noise": Variable(_LINE, _POWER, "expected power of noise behind a filter"),
     "line_shape": Variable(_LINE, "1", "that over the power interpolated from the bands"),
     "line_spectrum": Variable(("axis", "band"), _POWER, "expected power of lines in the bands"),
