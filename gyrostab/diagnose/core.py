@@ -148,9 +148,9 @@ def _run_steps(task: Task, block: Any) -> Diagnosis:
 
 def _identify_with_late_channels(task: Task, block: Any) -> tuple[Task, NamedBlocks]:
     """Steps 1 to 4; again with a channel moved in time if that explains more, each channel once."""
-    known = task.simulation.delay if isinstance(task.simulation, Model) else {}
+    model_delays = task.simulation.delay if isinstance(task.simulation, Model) else {}
     channels = log_channels(task.log)
-    delays = {name: delay_s for name, delay_s in known.items() if name in channels}
+    delays = {name: delay_s for name, delay_s in model_delays.items() if name in channels}
     reduced, named = _identify_with_delays(task, block, delays)
     while late := find_late_channel(named.identifications, named.baseline, reduced.log, delays):
         channel, delay_s = late

@@ -209,12 +209,14 @@ class NamedBlocks(NamedTuple):
     identifications: Identifications
 
 
-def lines_without_motion(task: Task, blocks: xr.Dataset, known: xr.Dataset) -> xr.Dataset:
-    """Return the blocks with line spectra from those in which no known effect moves the rate."""
-    moving = expect_known_motion(blocks, known, settings=task.settings)
+def lines_without_motion(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
+    """Return the blocks with line spectra from those in which the baseline does not move the rate."""
+    moving = expect_known_motion(blocks, baseline, settings=task.settings)
     at_rest = take_lines_at_rest(task, blocks, moving)
     return (
-        blocks if at_rest is blocks else remove_known_lines(at_rest, known, settings=task.settings)
+        blocks
+        if at_rest is blocks
+        else remove_known_lines(at_rest, baseline, settings=task.settings)
     )
 
 

@@ -162,16 +162,16 @@ def calibrate_noise(
     return assemble_baseline(blocks, posteriors, quiet=chosen, attrs=attrs, settings=settings)
 
 
-def calibrate_on_known(
-    blocks: xr.Dataset, baseline: xr.Dataset, known: Bools, *, settings: Settings = DEFAULTS
+def calibrate_on_training_blocks(
+    blocks: xr.Dataset, baseline: xr.Dataset, training: Bools, *, settings: Settings = DEFAULTS
 ) -> xr.Dataset:
-    """Calibrate the noise again on those quiescent blocks of a baseline that are known (block,).
+    """Calibrate the noise again on the quiescent blocks among the training blocks (block,).
 
     A baseline that is not that of `calibrate_noise` is returned as it is, and so is one of which
-    too few blocks with a spectrum are known.
+    too few such blocks have a spectrum.
     """
     has_spectrum = np.isfinite(blocks["power"].values).any(axis=-1)
-    chosen = baseline["quiet"].values & known & has_spectrum
+    chosen = baseline["quiet"].values & training & has_spectrum
     if (
         baseline.attrs.get("source") != "calibrated"
         or "recalibrated" in baseline.attrs

@@ -287,17 +287,17 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
     if chosen.sum() < MIN_BLOCKS or present.sum() < MIN_BLOCKS:
         return None
     bands = blocks.sizes["band"]
-    columns, known = axis_values(baseline, "columns", axis), _power_of_effects(state, axis)
+    columns, fixed_power = axis_values(baseline, "columns", axis), _power_of_effects(state, axis)
     cells = np.stack(
         [
             *columns.transpose(2, 0, 1),
             np.broadcast_to(np.arange(bands, dtype=np.float64), power.shape),
             np.broadcast_to(unspread_share(blocks)[row][:, None], power.shape),
-            known,
+            fixed_power,
         ],
         axis=-1,
     )
-    varies = np.ptp(known[chosen], axis=0).max() > _MIN_CHANGE * np.nanmin(power[chosen])
+    varies = np.ptp(fixed_power[chosen], axis=0).max() > _MIN_CHANGE * np.nanmin(power[chosen])
     fit = average_groups(
         power,
         shape,

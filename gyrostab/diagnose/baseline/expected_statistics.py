@@ -119,7 +119,11 @@ class PassedNoise(NamedTuple):
 
 
 def undo_transfer(
-    transfer: Callable[[Floats], Any], mean: Floats, variance: float, *, known: bool = False
+    transfer: Callable[[Floats], Any],
+    mean: Floats,
+    variance: float,
+    *,
+    variance_is_before: bool = False,
 ) -> PassedNoise:
     """Find the normal noise that has these block means and this variance after an effect.
 
@@ -130,7 +134,8 @@ def undo_transfer(
     mean : ndarray, shape (block,)
         Means after the effect, NaN where a block is missing, whose share is 1.
     variance : float
-        Variance of the samples about their means, after the effect or, if `known`, before it.
+        Variance of the samples about their means, after the effect, or before it
+        if `variance_is_before`.
 
     Examples
     --------
@@ -150,7 +155,7 @@ def undo_transfer(
         spread = passed.var(axis=1)
         gain = (passed * noise).mean(axis=1) / square
         before += after - passed.mean(axis=1)
-        if not known:
+        if not variance_is_before:
             left = float(weight @ spread) / square
             square *= np.clip(variance / max(left * square, 1e-300), 0.5, 2.0)
     share, moved = np.ones(mean.size), np.zeros(mean.size)

@@ -161,7 +161,7 @@ def _share_left(effect: Effect, model: Model, rows: list[int], blocks: xr.Datase
     for place, row in enumerate(rows):
         variance = model.coefficients(str(blocks["axis"].values[row]))["N"] ** 2 * HOUR * rate
         mean = blocks["mean"].values[row]
-        share[place] = undo_transfer(effect.transfer, mean, variance, known=True).share
+        share[place] = undo_transfer(effect.transfer, mean, variance, variance_is_before=True).share
     return share
 
 

@@ -33,14 +33,14 @@ class Fit(NamedTuple):
     power: Floats
     columns: Floats  # (cell, 4): power of the noise terms per squared coefficient
     weight: Floats
-    known: Floats | None = None  # (cell,): known power of effects
+    fixed_power: Floats | None = None  # (cell,): power of effects of fixed size
     free_columns: Floats | None = None  # (cell, column): power of effects per unit of free sizes
     precision: Floats | None = None  # (column,): precisions of normal priors of these sizes about 0
     start: Floats | None = None  # (cell,): expected powers to start from; white noise by default
 
     def rest(self) -> Floats:
-        """Return the powers minus the known ones."""
-        return self.power if self.known is None else self.power - self.known
+        """Return the powers without those of effects of fixed size."""
+        return self.power if self.fixed_power is None else self.power - self.fixed_power
 
     def free(self) -> tuple[Floats, Floats]:
         """Return columns and precisions of the free sizes."""
@@ -111,7 +111,7 @@ def fit_squares(fit: Fit) -> tuple[Floats, Floats, Floats]:
     spectrum = fit.columns @ square if fit.start is None else fit.start
     free_columns, precision = fit.free()
     # Otherwise the likelihood is not that of these powers alone.
-    has_powers_only = not free_columns.shape[1] and fit.known is None and fit.start is None
+    has_powers_only = not free_columns.shape[1] and fit.fixed_power is None and fit.start is None
     for _ in range(50):
         weight = fit.weight / spectrum**2
         normal, right, to_noise, to_right = _eliminate_free_sizes(
@@ -119,7 +119,7 @@ def fit_squares(fit: Fit) -> tuple[Floats, Floats, Floats]:
         )
         solution = solve_nonnegative(normal, right)
         next_spectrum = fit.columns @ solution
-        if free_columns.shape[1] or fit.known is not None:
+        if free_columns.shape[1] or fit.fixed_power is not None:
             of_effects = free_columns @ (to_right - to_noise @ solution)
             next_spectrum = next_spectrum + (fit.power - fit.rest()) + of_effects
             next_spectrum = np.maximum(next_spectrum, _MIN_POWER_RATIO * spectrum)
@@ -250,7 +250,7 @@ def _likelihood_of_powers(
     is_inside = np.all(best[:, :2] > 0.0, axis=1)
     used = np.where(is_inside[:, None], best, np.pad(best_without_q, ((0, 0), (1, 0))))
     expected = used @ fast_columns.T + slow + (fit.power - fit.rest())
-    if free_columns.shape[1] or fit.known is not None:
+    if free_columns.shape[1] or fit.fixed_power is not None:
         expected = np.maximum(expected, _MIN_POWER_RATIO * spectrum)
     likelihood = -(fit.weight * (np.log(expected) + fit.power / expected)).sum(axis=1)
     if free_columns.shape[1]:

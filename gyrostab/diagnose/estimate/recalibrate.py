@@ -49,9 +49,9 @@ LEVEL_GROUPS = 150  # of blocks of similar level, over which powers are averaged
 class AxisEffects:
     """What the effects do on one axis."""
 
-    known: Floats  # (block, band): power of fixed size
+    fixed_power: Floats  # (block, band): power of fixed size
     response: Floats  # (band, term): factor of the noise
-    doubt: float  # relative error of `known`
+    doubt: float  # relative error of `fixed_power`
     free: list[Floats] = field(default_factory=list)  # (block, band): power per unit of a free size
     means: list[Floats] = field(default_factory=list)  # (block,): means per unit of a free size
 
@@ -60,7 +60,7 @@ def recalibrate(
     identifications: Identifications,
     baseline: xr.Dataset,
     fitted: Sequence[Fitted],
-    known: Bools | None = None,
+    training: Bools | None = None,
 ) -> xr.Dataset:
     """Calibrate the noise with the identified effects in the model, those of free size free.
 
@@ -71,12 +71,17 @@ def recalibrate(
 
     The baseline that the identification started from is returned as it is unless it was calibrated
     on the recording. The new one has the steady random processes of the effects in the means;
-    ``attrs["recalibrated"]`` lists its axes. Only blocks `known` (block,) are used, by default all.
+    ``attrs["recalibrated"]`` lists its axes. Only the blocks `training` (block,) are used, by
+    default all.
     """
     if baseline.attrs.get("source") != "calibrated" or not identifications.identified:
         return baseline
     blocks = identifications.state.blocks
-    use = np.ones(blocks.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
+    use = (
+        np.ones(blocks.sizes["block"], np.bool_)
+        if training is None
+        else np.asarray(training, np.bool_)
+    )
     state = condition_on_selections(
         identifications.start_state(baseline), identifications.identified
     )
@@ -99,7 +104,7 @@ def recalibrate(
                 changed.append(axis)
                 quiet[row] = chosen
                 columns[row] = noise_powers(blocks, axis_effects.response)[row]
-                power[row] = columns[row] @ posterior.square + axis_effects.known
+                power[row] = columns[row] @ posterior.square + axis_effects.fixed_power
         posteriors.append(_kept_posterior(baseline, row) if posterior is None else posterior)
     if not changed:
         return baseline
@@ -207,10 +212,10 @@ def _collect_effects(
         touched |= bool(components)
         for component in components:
             if not component.is_filter:
-                known, free, means = component.statistic.noise_shares(
+                fixed_power, free, means = component.statistic.noise_shares(
                     component, axis, start, identifications.state.weight
                 )
-                out.known += known
+                out.fixed_power += fixed_power
                 out.free += [np.broadcast_to(column, shape) for column in free]
                 out.means += means
         numbers = next(
@@ -229,7 +234,7 @@ def _collect_effects(
             component.statistic.has_power_of_effect(component, identifications.state)
             for component in components
         ):
-            out.known += _effect_power(numbers.effect, blocks, axis)
+            out.fixed_power += _effect_power(numbers.effect, blocks, axis)
             errors = [
                 2.0 * estimate.stderr / abs(estimate.value)
                 for estimate in numbers.parameters.values()
@@ -308,16 +313,20 @@ def _average_powers(
     free_columns = [
         column / max(float(np.abs(column).max()), 1e-300) for column in axis_effects.free
     ]
-    effect_columns = np.stack([axis_effects.known, expected, *free_columns], axis=-1)
+    effect_columns = np.stack([axis_effects.fixed_power, expected, *free_columns], axis=-1)
     cells = np.nan_to_num(np.concatenate([columns, effect_columns], axis=-1))
     level = np.log(expected.mean(axis=1))
     fit = average_groups(power, shape, cells, level, chosen, LEVEL_GROUPS)
-    columns, (known, start), free = fit.columns[:, :4], fit.columns[:, 4:6].T, fit.columns[:, 6:]
+    columns, (fixed_power, start), free = (
+        fit.columns[:, :4],
+        fit.columns[:, 4:6].T,
+        fit.columns[:, 6:],
+    )
     precision = np.zeros(free.shape[1])
-    if np.any(known > 0.0):  # the predicted power has an error too
-        free = np.concatenate([free, known[:, None]], axis=1)
+    if np.any(fixed_power > 0.0):  # the predicted power has an error too
+        free = np.concatenate([free, fixed_power[:, None]], axis=1)
         precision = np.append(precision, 1.0 / axis_effects.doubt**2)
-    return Fit(fit.power, columns, fit.weight, known, free, precision, start)
+    return Fit(fit.power, columns, fit.weight, fixed_power, free, precision, start)
 
 
 def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
