@@ -15,12 +15,15 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
-from gyrostab.diagnose.baseline.known_effects import expect_known_motion, filtered_blocks
+from gyrostab.diagnose.baseline.known_effects import (
+    find_blocks_with_known_motion,
+    with_filtered_shapes,
+)
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.estimate.conditioned_baseline import expected_baseline, without_expected
 from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.recalibrate import remove_fast_switching
-from gyrostab.diagnose.estimate.unexplained_motion import unexplained_motion
+from gyrostab.diagnose.estimate.unexplained_motion import find_unexplained_motion
 from gyrostab.diagnose.identify.examination import prepare_examination
 from gyrostab.diagnose.identify.identification import components_of
 from gyrostab.diagnose.identify.late_channels import find_late_channel
@@ -197,13 +200,13 @@ def _calibrate_baseline(task: Task, blocks: xr.Dataset) -> tuple[xr.Dataset, xr.
     task.progress("calibrating", 0)
     if not isinstance(task.simulation, Model):
         return blocks, _make_baseline(task, blocks)
-    blocks = filtered_blocks(blocks, task.simulation)
+    blocks = with_filtered_shapes(blocks, task.simulation)
     baseline = _make_baseline(task, blocks)
-    moving = expect_known_motion(blocks, baseline, settings=task.settings)
+    moving = find_blocks_with_known_motion(blocks, baseline, settings=task.settings)
     if moving.any():
         # the model has the motion
         at_rest = task.without_motion(blocks, moving).drop_vars("moving")
-        blocks = filtered_blocks(at_rest, task.simulation)
+        blocks = with_filtered_shapes(at_rest, task.simulation)
         baseline = _make_baseline(task, blocks)
     return blocks, baseline
 
@@ -231,7 +234,9 @@ def _identify_effects(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> N
         records(),
         level=task.level / 2.0,
         seed=task.seed,
-        known=[effect for effect in known_effects if effect.name in baseline.attrs["left_out"]],
+        known=[
+            effect for effect in known_effects if effect.name in baseline.attrs["shown_elsewhere"]
+        ],
         progress=task.progress,
         settings=task.settings,
     )
@@ -276,7 +281,7 @@ def _leave_out_motion(task: Task, named: NamedBlocks) -> NamedBlocks | None:
     state = replace(
         identifications.start_state(named.baseline), weight=identifications.state.weight
     )
-    moving = unexplained_motion(blocks, identifications.identified, state)
+    moving = find_unexplained_motion(blocks, identifications.identified, state)
     if not moving.any():
         return None
     try:

@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools
-from gyrostab.diagnose.baseline.known_effects import expect_known_motion
+from gyrostab.diagnose.baseline.known_effects import find_blocks_with_known_motion
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.identify.examination import Identifications
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -210,8 +210,8 @@ class NamedBlocks(NamedTuple):
 
 
 def lines_without_motion(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
-    """Return the blocks with line spectra from those in which the baseline does not move the rate."""
-    moving = expect_known_motion(blocks, baseline, settings=task.settings)
+    """Return the blocks with line spectra from those in which no known effect moves the rate."""
+    moving = find_blocks_with_known_motion(blocks, baseline, settings=task.settings)
     at_rest = take_lines_at_rest(task, blocks, moving)
     return (
         blocks

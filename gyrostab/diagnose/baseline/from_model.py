@@ -46,7 +46,7 @@ def baseline_from_model(
     xarray.Dataset
         As from `calibrate_noise`; the noise has the error of that factor, or none. If axes share an
         effect of the model, with ``cross(pair, block, band)``, the expected cross-spectrum.
-        ``attrs["left_out"]`` lists the effects that also show elsewhere (in distributions,
+        ``attrs["shown_elsewhere"]`` lists the effects that also show elsewhere (in distributions,
         transfers, rotation orders, random wander): that part of them is not included.
 
     Raises
@@ -86,7 +86,7 @@ def baseline_from_model(
         posteriors, _ = scale_to_quiescent(blocks, posteriors, spectrum - added, added, chosen)
     squares = np.stack([posterior.square for posterior in posteriors])
     effects = expect_known_effects(blocks, parsed, squares)
-    attrs["left_out"] = effects.left_out
+    attrs["shown_elsewhere"] = effects.shown_elsewhere
     ramp = np.array([parsed.coefficients(axis)["R"] for axis in axes])
     out = assemble_baseline(
         blocks,

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Complexes
-from gyrostab.diagnose.baseline.known_effects import EVERYWHERE
+from gyrostab.diagnose.baseline.known_effects import GRID_MARK
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.examination import Identifications
 from gyrostab.diagnose.identify.identification import (
@@ -171,7 +171,7 @@ def add_outlier_power(
         prediction = effect_fit.effect.explain(
             replace(make_windows(blocks, {}), axes=tuple(effect_fit.axes))
         )
-        if EVERYWHERE in prediction.marks:
+        if GRID_MARK in prediction.marks:
             continue
         for name, density in prediction.spectrum.items():
             added[rows] += getattr(effect_fit.effect, name) ** 2 * density

@@ -219,7 +219,7 @@ def test_baseline_from_a_model_includes_its_effects():
     )
     z = ((blocks["mean"] - baseline["known_mean"]) / np.sqrt(baseline["mean_variance"])).values
     assert np.abs(z - z.mean(axis=1, keepdims=True)).max() < 5.0
-    assert baseline.attrs["left_out"] == ["telegraph"]
+    assert baseline.attrs["shown_elsewhere"] == ["telegraph"]
     assert float(baseline["coefficient"].sel(axis="x", term="R")) == 0.1
     assert float(baseline["stderr"].max()) == 0.0
     nulls = next(null_records(blocks, baseline, count=3, rng=np.random.default_rng(1)))
