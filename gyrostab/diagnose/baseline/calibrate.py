@@ -23,7 +23,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     white_variance,
 )
 from gyrostab.diagnose.baseline.posterior import (
-    Fit,
+    BandPowers,
     Posterior,
     average_blocks,
     fit_filter_response,
@@ -187,13 +187,13 @@ def calibrate_on_training_blocks(
 def calibrate_axes(blocks: xr.Dataset, chosen: Bools, settings: Settings) -> list[Posterior]:
     """Compute the noise of every axis from the chosen blocks (axis, block)."""
     posteriors = []
-    for row, fit in enumerate(_fit_quiescent_powers(blocks, chosen, settings)):
-        explained = _keep_explained_bands(fit, settings)
+    for row, bands in enumerate(_fit_quiescent_powers(blocks, chosen, settings)):
+        explained = _keep_explained_bands(bands, settings)
         square = with_floor(fit_squares(explained)[0], explained)
         variance = white_variance(blocks, square[None])[row]
         levels = _level_columns(chosen[row], settings.min_quiescent_blocks)
-        posterior = noise_posterior(fit, blocks, row, variance, chosen[row], levels, settings)
-        of_means = None if explained is fit else square
+        posterior = noise_posterior(bands, blocks, row, variance, chosen[row], levels, settings)
+        of_means = None if explained is bands else square
         posteriors.append(posterior._replace(of_means=of_means))
     return posteriors
 
@@ -224,45 +224,51 @@ def _level_columns(quiet: Bools, min_blocks: int) -> Floats:
     return np.stack(columns, axis=1) if columns else np.empty((quiet.size, 0))
 
 
-def _fit_quiescent_powers(blocks: xr.Dataset, chosen: Bools, settings: Settings) -> list[Fit]:
+def _fit_quiescent_powers(
+    blocks: xr.Dataset, chosen: Bools, settings: Settings
+) -> list[BandPowers]:
     """Return the powers of every axis as a sum of noise terms, behind a filter if it takes one.
 
     It does where some bands are foreign to the noise terms alone, and none behind the filter.
     """
-    fits = _average_quiescent(blocks, chosen, noise_powers(blocks))
+    bands_by_axis = _average_quiescent(blocks, chosen, noise_powers(blocks))
     if (
-        not any(_has_foreign_bands(fit, settings) for fit in fits)
-        or min(fit.power.size for fit in fits) < blocks.sizes["band"]
+        not any(_has_foreign_bands(bands, settings) for bands in bands_by_axis)
+        or min(bands.power.size for bands in bands_by_axis) < blocks.sizes["band"]
     ):
-        return fits
-    response = fit_filter_response(blocks, fits, settings=settings)
+        return bands_by_axis
+    response = fit_filter_response(blocks, bands_by_axis, settings=settings)
     if response is None:
-        return fits
+        return bands_by_axis
     filtered = _average_quiescent(blocks, chosen, noise_powers(blocks, response))
-    return fits if any(_has_foreign_bands(fit, settings) for fit in filtered) else filtered
+    return (
+        bands_by_axis
+        if any(_has_foreign_bands(bands, settings) for bands in filtered)
+        else filtered
+    )
 
 
-def _average_quiescent(blocks: xr.Dataset, chosen: Bools, columns: Floats) -> list[Fit]:
+def _average_quiescent(blocks: xr.Dataset, chosen: Bools, columns: Floats) -> list[BandPowers]:
     """Average the powers of the chosen blocks of every axis; columns (axis, block, band, term)."""
     power, shape = blocks["power"].values, reduced_shape(blocks)
-    fits = []
+    bands_by_axis = []
     for row, axis in enumerate(blocks["axis"].values):
         use = chosen[row]
-        fit = average_blocks(power[row][use], shape[row][use], columns[row][use])
-        bands = np.count_nonzero(fit.power > 0.0)
-        if bands < 4:
+        bands = average_blocks(power[row][use], shape[row][use], columns[row][use])
+        band_count = np.count_nonzero(bands.power > 0.0)
+        if band_count < 4:
             raise SchemaError(
-                f"axis {axis}: the quiescent blocks hold noise in {bands} bands, too few to "
+                f"axis {axis}: the quiescent blocks hold noise in {band_count} bands, too few to "
                 "calibrate on; give other stretches with --quiet, leave the axis out (--axis), or "
                 "diagnose a part of the record with fewer gaps"
             )
-        fits.append(fit)
-    return fits
+        bands_by_axis.append(bands)
+    return bands_by_axis
 
 
-def _has_foreign_bands(fit: Fit, settings: Settings) -> bool:
+def _has_foreign_bands(bands: BandPowers, settings: Settings) -> bool:
     """Return whether the noise terms miss the larger part of the power of a band."""
-    return bool(_is_foreign(_power_ratio(fit), fit.weight, settings).any())
+    return bool(_is_foreign(_power_ratio(bands), bands.weight, settings).any())
 
 
 def _is_foreign(ratio: Floats, weight: Floats, settings: Settings) -> Bools:
@@ -276,28 +282,28 @@ def _is_foreign(ratio: Floats, weight: Floats, settings: Settings) -> Bools:
     )
 
 
-def _keep_explained_bands(fit: Fit, settings: Settings) -> Fit:
+def _keep_explained_bands(bands: BandPowers, settings: Settings) -> BandPowers:
     """Drop the bands that the noise terms do not explain, the worst first.
 
     Lines and humps would raise the noise of block means, to which they add nothing. A spectrum
     that the terms describe to a factor of two keeps all bands.
     """
-    if not _has_foreign_bands(fit, settings):
-        return fit
-    while fit.power.size > MIN_BANDS:
-        off = np.abs(_power_ratio(fit) - 1.0) * np.sqrt(fit.weight)
+    if not _has_foreign_bands(bands, settings):
+        return bands
+    while bands.power.size > MIN_BANDS:
+        off = np.abs(_power_ratio(bands) - 1.0) * np.sqrt(bands.weight)
         worst = int(off.argmax())
         if off[worst] <= settings.excess_sigma:
             break
-        fit = Fit(
-            *(np.delete(part, worst, axis=0) for part in (fit.power, fit.columns, fit.weight))
+        bands = BandPowers(
+            *(np.delete(part, worst, axis=0) for part in (bands.power, bands.columns, bands.weight))
         )
-    return fit
+    return bands
 
 
-def _power_ratio(fit: Fit) -> Floats:
+def _power_ratio(bands: BandPowers) -> Floats:
     """Return the powers over those of the noise terms that fit them best."""
-    return np.asarray(fit.power / (fit.columns @ fit_squares(fit)[0]))
+    return np.asarray(bands.power / (bands.columns @ fit_squares(bands)[0]))
 
 
 def assemble_baseline(

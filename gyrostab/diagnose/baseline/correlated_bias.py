@@ -24,7 +24,7 @@ from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.diagnose.baseline.axis_means import AxisMeans, maximise_likelihood
 from gyrostab.diagnose.baseline.expected_statistics import reduced_shape
 from gyrostab.diagnose.baseline.posterior import (
-    Fit,
+    BandPowers,
     average_groups,
     fine_grid,
     fit_squares,
@@ -78,7 +78,7 @@ class _AxisRecord:
     """Means and powers of an axis, and what they are explained by."""
 
     blocks: xr.Dataset
-    fit: Fit
+    bands: BandPowers
     noise: Floats  # (cell,): power of Q and N that fit best without slow noise
     effects: Floats  # (cell,): power of the effects in the model
     band: Ints  # (cell,)
@@ -96,7 +96,7 @@ class _AxisRecord:
         N are the likeliest ones in the powers; the means have the white noise of the calibration.
         """
         K, B, *bias = np.exp(np.clip(points, *self.ends[: points.shape[1]].T)).T
-        added = self.effects + np.square([B, K]).T @ self.fit.columns[:, 2:].T
+        added = self.effects + np.square([B, K]).T @ self.bands.columns[:, 2:].T
         means = [self.means] * len(points)
         if bias:
             variance, time = bias[0] ** 2 / bias[1], bias[1]
@@ -109,16 +109,16 @@ class _AxisRecord:
             axis_means.log_likelihood(K[[i]], B[[i]])[0] for i, axis_means in enumerate(means)
         ]
         expected = self._fit_fast_noise(added)
-        of_powers = (np.log(expected) + self.fit.power / expected) @ self.fit.weight
+        of_powers = (np.log(expected) + self.bands.power / expected) @ self.bands.weight
         return np.array([of_means, -of_powers])
 
     def _fit_fast_noise(self, added: Floats) -> Floats:
         """Return the expected powers, those of the likeliest Q and N added (Fisher scoring)."""
-        columns, least = self.fit.columns[:, :2], _MIN_NOISE_SHARE * self.noise
+        columns, least = self.bands.columns[:, :2], _MIN_NOISE_SHARE * self.noise
         expected = np.maximum(self.noise + added, least)
         for _ in range(_SCORING_STEPS):
-            weighted = columns.T * (self.fit.weight / expected**2)[:, None]
-            right = (weighted @ (self.fit.power - added)[..., None])[..., 0]
+            weighted = columns.T * (self.bands.weight / expected**2)[:, None]
+            right = (weighted @ (self.bands.power - added)[..., None])[..., 0]
             square = solve_nonnegative(weighted @ columns, right)
             expected = np.maximum(square @ columns.T + added, least)
         return expected
@@ -130,10 +130,10 @@ class _AxisRecord:
         1 for a good fit (McCullagh and Nelder 1989, Generalized Linear Models, sec. 8.3).
         """
         of_powers = float(self.log_likelihoods(point[None])[1, 0])
-        weight, power = self.fit.weight, self.fit.power
+        weight, power = self.bands.weight, self.bands.power
         deviance = 2.0 * (-float((weight * (np.log(power) + 1.0)).sum()) - of_powers)
         scatter = max(deviance / max(power.size - point.size - 2, 1), 1.0)
-        return replace(self, fit=self.fit._replace(weight=weight / scatter))
+        return replace(self, bands=self.bands._replace(weight=weight / scatter))
 
     def start_grid(self) -> Floats:
         """Return the values of each parameter from which a search may start, (parameter, value)."""
@@ -286,19 +286,19 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
     present = np.isfinite(values[:, 0])
     if chosen.sum() < MIN_BLOCKS or present.sum() < MIN_BLOCKS:
         return None
-    bands = blocks.sizes["band"]
+    band_count = blocks.sizes["band"]
     columns, fixed_power = axis_values(baseline, "columns", axis), _power_of_effects(state, axis)
     cells = np.stack(
         [
             *columns.transpose(2, 0, 1),
-            np.broadcast_to(np.arange(bands, dtype=np.float64), power.shape),
+            np.broadcast_to(np.arange(band_count, dtype=np.float64), power.shape),
             np.broadcast_to(unspread_share(blocks)[row][:, None], power.shape),
             fixed_power,
         ],
         axis=-1,
     )
     varies = np.ptp(fixed_power[chosen], axis=0).max() > _MIN_CHANGE * np.nanmin(power[chosen])
-    fit = average_groups(
+    bands = average_groups(
         power,
         shape,
         np.nan_to_num(cells),
@@ -306,9 +306,9 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
         chosen,
         _LEVEL_GROUPS if varies else 1,
     )
-    columns = fit.columns
-    fit = Fit(fit.power, columns[:, :4], fit.weight)
-    square = with_floor(fit_squares(fit)[0], fit)
+    columns = bands.columns
+    bands = BandPowers(bands.power, columns[:, :4], bands.weight)
+    square = with_floor(fit_squares(bands)[0], bands)
     block, variance = float(blocks.attrs["block_s"]), axis_values(baseline, "mean_variance", axis)
     means = AxisMeans(
         np.where(present[:, None], values, 0.0),
@@ -332,8 +332,8 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
     )
     return _AxisRecord(
         blocks,
-        fit,
-        fit.columns[:, :2] @ square[:2],
+        bands,
+        bands.columns[:, :2] @ square[:2],
         columns[:, 6],
         np.rint(columns[:, 4]).astype(np.int64),
         columns[:, 5],

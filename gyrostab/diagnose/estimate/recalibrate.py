@@ -23,7 +23,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
 )
 from gyrostab.diagnose.baseline.known_effects import random_means
 from gyrostab.diagnose.baseline.posterior import (
-    Fit,
+    BandPowers,
     Posterior,
     average_groups,
     fit_squares,
@@ -287,18 +287,20 @@ def _fit_noise(
     if chosen.sum() < MIN_BLOCKS:
         return None
     columns = noise_powers(blocks, axis_effects.response)[row]
-    fit = _average_powers(power, shape, columns, state.weight[row], axis_effects, chosen)
-    square, information, _ = fit_squares(fit)
-    assert fit.start is not None
-    plain = float((fit.weight / np.square(fit.start) * fit.columns[:, 1] ** 2).sum())
+    bands = _average_powers(power, shape, columns, state.weight[row], axis_effects, chosen)
+    square, information, _ = fit_squares(bands)
+    assert bands.start is not None
+    plain = float((bands.weight / np.square(bands.start) * bands.columns[:, 1] ** 2).sum())
     if not information[1, 1] > state.settings.min_information_share * plain or not square[1] > 0.0:
         return None
-    square = with_floor(square, fit)
+    square = with_floor(square, bands)
     variance = white_variance(blocks, square[None])[row]
     unfiltered = noise_powers(blocks)[row, :, 0] @ square
     variance = variance * np.maximum(state.weight[row, :, 0] / unfiltered, 0.1)
     effect_means = np.stack(axis_effects.means, axis=1) if axis_effects.means else None
-    return noise_posterior(fit, blocks, row, variance, chosen, effect_means, state.settings, wander)
+    return noise_posterior(
+        bands, blocks, row, variance, chosen, effect_means, state.settings, wander
+    )
 
 
 def _average_powers(
@@ -308,7 +310,7 @@ def _average_powers(
     expected: Floats,
     axis_effects: AxisEffects,
     chosen: Bools,
-) -> Fit:
+) -> BandPowers:
     """Average the powers over blocks of similar level."""
     free_columns = [
         column / max(float(np.abs(column).max()), 1e-300) for column in axis_effects.free
@@ -316,17 +318,17 @@ def _average_powers(
     effect_columns = np.stack([axis_effects.fixed_power, expected, *free_columns], axis=-1)
     cells = np.nan_to_num(np.concatenate([columns, effect_columns], axis=-1))
     level = np.log(expected.mean(axis=1))
-    fit = average_groups(power, shape, cells, level, chosen, LEVEL_GROUPS)
+    bands = average_groups(power, shape, cells, level, chosen, LEVEL_GROUPS)
     columns, (fixed_power, start), free = (
-        fit.columns[:, :4],
-        fit.columns[:, 4:6].T,
-        fit.columns[:, 6:],
+        bands.columns[:, :4],
+        bands.columns[:, 4:6].T,
+        bands.columns[:, 6:],
     )
     precision = np.zeros(free.shape[1])
     if np.any(fixed_power > 0.0):  # the predicted power has an error too
         free = np.concatenate([free, fixed_power[:, None]], axis=1)
         precision = np.append(precision, 1.0 / axis_effects.doubt**2)
-    return Fit(fit.power, columns, fit.weight, fixed_power, free, precision, start)
+    return BandPowers(bands.power, columns, bands.weight, fixed_power, free, precision, start)
 
 
 def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
