@@ -55,14 +55,14 @@ _MIN_LOW_SHAPE = 20.0  # of the lowest bands, which define the white noise of a 
 
 
 def _mean_noise_excess(
-    power: Floats, shape: Floats, spectrum: Floats, quiet: Bools, settings: Settings
+    power: Floats, shape: Floats, spectrum: Floats, quiescent: Bools, settings: Settings
 ) -> Floats:
     """Return the excess factor of the white variance of each mean, from the lowest bands.
 
     Bands that the noise does not explain in quiescent blocks tell nothing of the noise of a mean.
     Inputs (block, band).
     """
-    ratio, total = weighted_mean(power / spectrum, np.where(quiet[:, None], shape, 0.0))
+    ratio, total = weighted_mean(power / spectrum, np.where(quiescent[:, None], shape, 0.0))
     explained = ~_is_foreign(ratio, total, settings)
     if explained.sum() >= MIN_BANDS:
         power, shape, spectrum = power[:, explained], shape[:, explained], spectrum[:, explained]
@@ -156,10 +156,12 @@ def calibrate_noise(
     >>> bool(abs(error) < 4.0), baseline.attrs["source"]
     (True, 'calibrated')
     """
-    chosen = find_quiescent_blocks(blocks, quiet, settings=settings)
-    attrs = {"source": "calibrated", "calibrated_on": find_quiescent_spans(blocks, chosen)}
-    posteriors = calibrate_axes(blocks, chosen, settings)
-    return assemble_baseline(blocks, posteriors, quiet=chosen, attrs=attrs, settings=settings)
+    quiescent = find_quiescent_blocks(blocks, quiet, settings=settings)
+    attrs = {"source": "calibrated", "calibrated_on": find_quiescent_spans(blocks, quiescent)}
+    posteriors = calibrate_axes(blocks, quiescent, settings)
+    return assemble_baseline(
+        blocks, posteriors, quiescent=quiescent, attrs=attrs, settings=settings
+    )
 
 
 def calibrate_on_training_blocks(
@@ -171,34 +173,34 @@ def calibrate_on_training_blocks(
     too few such blocks have a spectrum.
     """
     has_spectrum = np.isfinite(blocks["power"].values).any(axis=-1)
-    chosen = baseline["quiet"].values & training & has_spectrum
+    quiescent = baseline["quiet"].values & training & has_spectrum
     if (
         baseline.attrs.get("source") != "calibrated"
         or "recalibrated" in baseline.attrs
-        or chosen.sum(axis=1).min() < settings.min_quiescent_blocks
+        or quiescent.sum(axis=1).min() < settings.min_quiescent_blocks
     ):
         return baseline
-    posteriors = calibrate_axes(blocks, chosen, settings)
+    posteriors = calibrate_axes(blocks, quiescent, settings)
     return assemble_baseline(
-        blocks, posteriors, quiet=chosen, attrs=baseline.attrs, settings=settings
+        blocks, posteriors, quiescent=quiescent, attrs=baseline.attrs, settings=settings
     )
 
 
-def calibrate_axes(blocks: xr.Dataset, chosen: Bools, settings: Settings) -> list[Posterior]:
-    """Compute the noise of every axis from the chosen blocks (axis, block)."""
+def calibrate_axes(blocks: xr.Dataset, quiescent: Bools, settings: Settings) -> list[Posterior]:
+    """Compute the noise of every axis from its quiescent blocks (axis, block)."""
     posteriors = []
-    for row, bands in enumerate(_fit_quiescent_powers(blocks, chosen, settings)):
+    for row, bands in enumerate(_fit_quiescent_powers(blocks, quiescent, settings)):
         explained = _keep_explained_bands(bands, settings)
         square = with_floor(fit_squares(explained)[0], explained)
         variance = white_variance(blocks, square[None])[row]
-        levels = _level_columns(chosen[row], settings.min_quiescent_blocks)
-        posterior = noise_posterior(bands, blocks, row, variance, chosen[row], levels, settings)
-        of_means = None if explained is bands else square
-        posteriors.append(posterior._replace(of_means=of_means))
+        levels = _level_columns(quiescent[row], settings.min_quiescent_blocks)
+        posterior = noise_posterior(bands, blocks, row, variance, quiescent[row], levels, settings)
+        squares_for_means = None if explained is bands else square
+        posteriors.append(posterior._replace(squares_for_means=squares_for_means))
     return posteriors
 
 
-def _level_columns(quiet: Bools, min_blocks: int) -> Floats:
+def _level_columns(quiescent: Bools, min_blocks: int) -> Floats:
     """Return steps that give each quiescent stretch its own level, (block, step).
 
     What moves the bias between two stretches, vibration for instance, is not noise of either. A
@@ -213,25 +215,25 @@ def _level_columns(quiet: Bools, min_blocks: int) -> Floats:
     >>> _level_columns(np.array([1, 1, 0, 1, 1, 0, 0, 1], bool), 3).T
     array([[0., 0., 0., 0., 0., 0., 0., 1.]])
     """
-    starts = np.flatnonzero(quiet & ~np.append(False, quiet[:-1]))
-    block = np.arange(quiet.size)
+    starts = np.flatnonzero(quiescent & ~np.append(False, quiescent[:-1]))
+    block = np.arange(quiescent.size)
     columns: list[Floats] = []
     last = 0
     for first in starts.tolist():
-        if quiet[last:first].sum() >= min_blocks:
+        if quiescent[last:first].sum() >= min_blocks:
             columns.append((block >= first).astype(np.float64))
             last = first
-    return np.stack(columns, axis=1) if columns else np.empty((quiet.size, 0))
+    return np.stack(columns, axis=1) if columns else np.empty((quiescent.size, 0))
 
 
 def _fit_quiescent_powers(
-    blocks: xr.Dataset, chosen: Bools, settings: Settings
+    blocks: xr.Dataset, quiescent: Bools, settings: Settings
 ) -> list[BandPowers]:
     """Return the powers of every axis as a sum of noise terms, behind a filter if it takes one.
 
     It does where some bands are foreign to the noise terms alone, and none behind the filter.
     """
-    bands_by_axis = _average_quiescent(blocks, chosen, noise_powers(blocks))
+    bands_by_axis = _average_quiescent(blocks, quiescent, noise_powers(blocks))
     if (
         not any(_has_foreign_bands(bands, settings) for bands in bands_by_axis)
         or min(bands.power.size for bands in bands_by_axis) < blocks.sizes["band"]
@@ -240,7 +242,7 @@ def _fit_quiescent_powers(
     response = fit_filter_response(blocks, bands_by_axis, settings=settings)
     if response is None:
         return bands_by_axis
-    filtered = _average_quiescent(blocks, chosen, noise_powers(blocks, response))
+    filtered = _average_quiescent(blocks, quiescent, noise_powers(blocks, response))
     return (
         bands_by_axis
         if any(_has_foreign_bands(bands, settings) for bands in filtered)
@@ -248,12 +250,12 @@ def _fit_quiescent_powers(
     )
 
 
-def _average_quiescent(blocks: xr.Dataset, chosen: Bools, columns: Floats) -> list[BandPowers]:
-    """Average the powers of the chosen blocks of every axis; columns (axis, block, band, term)."""
+def _average_quiescent(blocks: xr.Dataset, quiescent: Bools, columns: Floats) -> list[BandPowers]:
+    """Average the quiescent powers of every axis; columns (axis, block, band, term)."""
     power, shape = blocks["power"].values, reduced_shape(blocks)
     bands_by_axis = []
     for row, axis in enumerate(blocks["axis"].values):
-        use = chosen[row]
+        use = quiescent[row]
         bands = average_blocks(power[row][use], shape[row][use], columns[row][use])
         band_count = np.count_nonzero(bands.power > 0.0)
         if band_count < 4:
@@ -310,7 +312,7 @@ def assemble_baseline(
     blocks: xr.Dataset,
     posteriors: list[Posterior],
     *,
-    quiet: Bools,
+    quiescent: Bools,
     attrs: Mapping[str, Any],
     known_mean: Floats | None = None,
     spectrum: Floats | None = None,
@@ -331,18 +333,18 @@ def assemble_baseline(
     expected = noise if spectrum is None else spectrum
     power, shape = blocks["power"].values, blocks["shape"].values
     floor = np.array([1e-3 * levels.min() / HOUR for levels in expected])
-    of_means, spectrum_of_means = square.copy(), expected.copy()
+    squares_for_means, spectrum_of_means = square.copy(), expected.copy()
     for row, posterior in enumerate(posteriors):
-        if posterior.of_means is not None:
-            of_means[row] = posterior.of_means
-            spectrum_of_means[row] *= columns[row] @ posterior.of_means / noise[row]
-    of_means[:, 1] = np.maximum(of_means[:, 1], floor)
-    white = white_variance(blocks, of_means)
+        if posterior.squares_for_means is not None:
+            squares_for_means[row] = posterior.squares_for_means
+            spectrum_of_means[row] *= columns[row] @ posterior.squares_for_means / noise[row]
+    squares_for_means[:, 1] = np.maximum(squares_for_means[:, 1], floor)
+    white = white_variance(blocks, squares_for_means)
     white = white * np.maximum(expected[..., 0] / noise[..., 0], 0.1)
     variance = white * np.stack(
         [
             _mean_noise_excess(*arrays, settings)
-            for arrays in zip(power, shape, spectrum_of_means, quiet, strict=True)
+            for arrays in zip(power, shape, spectrum_of_means, quiescent, strict=True)
         ]
     )
     span = blocks.sizes["block"] * float(blocks.attrs["block_s"])
@@ -355,13 +357,13 @@ def assemble_baseline(
         for posterior in posteriors
     ]
     value, error = np.mean(roots, axis=1), np.std(roots, axis=1)
-    ramp_error = _ramp_error(blocks, white, value, quiet)
+    ramp_error = _ramp_error(blocks, white, value, quiescent)
     variables = {
         "coefficient": np.pad(value, ((0, 0), (0, 1))),
         "stderr": np.column_stack([error, ramp_error]),
-        "quiet": quiet,
+        "quiet": quiescent,
         "spectrum": expected,
-        "known_mean": np.zeros(quiet.shape) if known_mean is None else known_mean,
+        "known_mean": np.zeros(quiescent.shape) if known_mean is None else known_mean,
         "mean_variance": variance,
         "angle_variance": np.array([posterior.angle for posterior in posteriors]),
         "common": common,
@@ -381,24 +383,28 @@ def assemble_baseline(
         for name in ("axis", "time", "begin", "end", "frequency", "band_low", "band_high")
         if name in blocks
     }
-    of_axes = [*zip(map(str, blocks["axis"].values), posteriors, strict=True)]
+    axis_posteriors = [*zip(map(str, blocks["axis"].values), posteriors, strict=True)]
     return xr.Dataset(
         label_variables(variables, BASELINE),
         coords={**coordinates, "term": list(TERMS), "noise": list(NOISE), "slow": ["B", "K"]},
         attrs={
             **attrs,
-            "slow_noise_apart": [axis for axis, posterior in of_axes if not posterior.joined],
+            "slow_noise_apart": [
+                axis for axis, posterior in axis_posteriors if not posterior.joined
+            ],
             "white_noise_of_means_apart": [
-                axis for axis, posterior in of_axes if posterior.of_means is not None
+                axis
+                for axis, posterior in axis_posteriors
+                if posterior.squares_for_means is not None
             ],
         },
     )
 
 
-def _ramp_error(blocks: xr.Dataset, white: Floats, value: Floats, quiet: Bools) -> Floats:
+def _ramp_error(blocks: xr.Dataset, white: Floats, value: Floats, quiescent: Bools) -> Floats:
     """Return the error of a ramp fitted to the quiescent means [deg/h^2]."""
     hours = (blocks["begin"].values + blocks["end"].values)[:, None] / (2.0 * HOUR)
-    present = quiet & np.isfinite(blocks["mean"].values)
+    present = quiescent & np.isfinite(blocks["mean"].values)
     step = float(blocks.attrs["block_s"])
     error = np.full(len(white), np.inf)
     for row, variance in enumerate(white):

@@ -105,12 +105,12 @@ class _AxisRecord:
                 for process in zip(variance.tolist(), time.tolist(), strict=True)
             ]
             added = added + variance[:, None] * self._unit_powers(time)
-        of_means = [
+        mean_nats = [
             axis_means.log_likelihood(K[[i]], B[[i]])[0] for i, axis_means in enumerate(means)
         ]
         expected = self._fit_fast_noise(added)
-        of_powers = (np.log(expected) + self.bands.power / expected) @ self.bands.weight
-        return np.array([of_means, -of_powers])
+        power_nats = -((np.log(expected) + self.bands.power / expected) @ self.bands.weight)
+        return np.array([mean_nats, power_nats])
 
     def _fit_fast_noise(self, added: Floats) -> Floats:
         """Return the expected powers, those of the likeliest Q and N added (Fisher scoring)."""
@@ -129,9 +129,9 @@ class _AxisRecord:
         Their scatter about those of these parameters is their deviance over its degrees of freedom,
         1 for a good fit (McCullagh and Nelder 1989, Generalized Linear Models, sec. 8.3).
         """
-        of_powers = float(self.log_likelihoods(point[None])[1, 0])
+        power_nats = float(self.log_likelihoods(point[None])[1, 0])
         weight, power = self.bands.weight, self.bands.power
-        deviance = 2.0 * (-float((weight * (np.log(power) + 1.0)).sum()) - of_powers)
+        deviance = 2.0 * (-float((weight * (np.log(power) + 1.0)).sum()) - power_nats)
         scatter = max(deviance / max(power.size - point.size - 2, 1), 1.0)
         return replace(self, bands=self.bands._replace(weight=weight / scatter))
 

@@ -91,7 +91,7 @@ def baseline_from_model(
     out = assemble_baseline(
         blocks,
         posteriors,
-        quiet=chosen,
+        quiescent=chosen,
         attrs=attrs,
         known_mean=effects.mean + expect_ramp(blocks, ramp),
         spectrum=effects.spectrum,
@@ -135,7 +135,7 @@ def _describe_lines(baseline: xr.Dataset, blocks: xr.Dataset, square: Floats) ->
 
 
 def scale_to_quiescent(
-    blocks: xr.Dataset, posteriors: list[Posterior], noise: Floats, added: Floats, quiet: Bools
+    blocks: xr.Dataset, posteriors: list[Posterior], noise: Floats, added: Floats, quiescent: Bools
 ) -> tuple[list[Posterior], Floats]:
     """Scale the noise of a simulation to its level in quiescent blocks of the recording; say so.
 
@@ -143,7 +143,7 @@ def scale_to_quiescent(
     ----------
     noise, added : ndarray, shape (axis, block, band)
         Expected power of the noise, and power that effects of the simulation add.
-    quiet : ndarray of bool, shape (axis, block)
+    quiescent : ndarray of bool, shape (axis, block)
         Blocks to calibrate on.
 
     Returns
@@ -160,7 +160,7 @@ def scale_to_quiescent(
     """
     factors, scaled, sizes = [], [], []
     for row, (axis, posterior) in enumerate(zip(blocks["axis"].values, posteriors, strict=True)):
-        fitted = fit_noise_factor(blocks.isel(axis=[row]), noise[row], added[row], quiet[row])
+        fitted = fit_noise_factor(blocks.isel(axis=[row]), noise[row], added[row], quiescent[row])
         if fitted is None:
             raise SchemaError(
                 f"axis {axis}: the quiescent blocks hold no spectrum to calibrate the simulation "

@@ -81,7 +81,7 @@ def baseline_from_simulation(
     baseline = assemble_baseline(
         blocks,
         posteriors,
-        quiet=chosen,
+        quiescent=chosen,
         attrs={"source": "simulation", "calibrated_on": spans},
         spectrum=spectrum,
         settings=settings,

@@ -77,9 +77,9 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Floats) -> Kn
     wandering: list[tuple[Prediction, list[int], Callable[[str], Floats]]] = []
     shown_elsewhere = []
     for effect, rows in _effects_on_rows(model, axes):
-        of_effect = tuple(axes[row] for row in rows)
-        sizes = partial(effect.expand_to_axes, axes=of_effect)
-        prediction = with_correlated_powers(predict_effect(effect, blocks, of_effect), blocks)
+        axis_names = tuple(axes[row] for row in rows)
+        sizes = partial(effect.expand_to_axes, axes=axis_names)
+        prediction = with_correlated_powers(predict_effect(effect, blocks, axis_names), blocks)
         has_anomalous_samples = bool({*prediction.marks} - {GRID_MARK})
         if has_anomalous_samples or _shows_elsewhere(prediction):
             shown_elsewhere.append(effect.name)

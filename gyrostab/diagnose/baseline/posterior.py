@@ -64,7 +64,7 @@ class Posterior(NamedTuple):
     slow: Floats
     joined: bool  # whether band powers and means agree about B and K
     #: (4,): squares that fit the bands best which the noise terms explain; None if these are all.
-    of_means: Floats | None = None
+    squares_for_means: Floats | None = None
     angle: float = 0.0  # variance of the angle where blocks meet [arcsec2]
 
 
@@ -121,8 +121,8 @@ def fit_squares(bands: BandPowers) -> tuple[Floats, Floats, Floats]:
         solution = solve_nonnegative(normal, right)
         next_spectrum = bands.columns @ solution
         if free_columns.shape[1] or bands.fixed_power is not None:
-            of_effects = free_columns @ (to_right - to_noise @ solution)
-            next_spectrum = next_spectrum + (bands.power - bands.rest()) + of_effects
+            power_of_effects = free_columns @ (to_right - to_noise @ solution)
+            next_spectrum = next_spectrum + (bands.power - bands.rest()) + power_of_effects
             next_spectrum = np.maximum(next_spectrum, _MIN_POWER_RATIO * spectrum)
         if not (next_spectrum > 0.0).all():
             break

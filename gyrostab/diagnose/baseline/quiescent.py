@@ -242,8 +242,10 @@ def _seconds_since_start(blocks: xr.Dataset, edge: Any) -> float:
     return float((instant - start) / np.timedelta64(1, "ns")) / 1e9
 
 
-def find_quiescent_spans(blocks: xr.Dataset, quiet: Bools) -> list[list[str]]:
+def find_quiescent_spans(blocks: xr.Dataset, quiescent: Bools) -> list[list[str]]:
     """Return the spans in which any axis is quiescent, [start, end] as ISO times."""
-    edges = np.flatnonzero(np.diff(quiet.any(axis=0), prepend=False, append=False)).reshape(-1, 2)
+    edges = np.flatnonzero(np.diff(quiescent.any(axis=0), prepend=False, append=False)).reshape(
+        -1, 2
+    )
     begin, end = blocks["begin"].values, blocks["end"].values
     return [[iso(blocks, begin[first]), iso(blocks, end[last - 1])] for first, last in edges]

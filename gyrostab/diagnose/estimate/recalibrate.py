@@ -90,19 +90,19 @@ def recalibrate(
     columns = noise_powers(blocks)
     processes = _find_processes(fitted, blocks)
     with_processes = baseline.assign(processes)
-    changed, quiet = [], baseline["quiet"].values.copy()
+    changed, quiescent = [], baseline["quiet"].values.copy()
     for row, axis in enumerate(state.axes):
         axis_effects = _collect_effects(identifications, baseline, fitted, axis)
         posterior = None
         has_walk = expected_processes(state.baseline, row).walk.any()
         if axis_effects is not None and not has_walk:
             has_unidentified = any(axis in selection.axes for selection in identifications.unknown)
-            chosen = use & ~state.masked[row] & (quiet[row] if has_unidentified else True)
+            chosen = use & ~state.masked[row] & (quiescent[row] if has_unidentified else True)
             wander = expected_processes(with_processes, row)
             posterior = _fit_noise(state, row, axis_effects, chosen, wander)
             if posterior is not None:
                 changed.append(axis)
-                quiet[row] = chosen
+                quiescent[row] = chosen
                 columns[row] = noise_powers(blocks, axis_effects.response)[row]
                 power[row] = columns[row] @ posterior.square + axis_effects.fixed_power
         posteriors.append(_kept_posterior(baseline, row) if posterior is None else posterior)
@@ -111,7 +111,7 @@ def recalibrate(
     out = assemble_baseline(
         blocks,
         posteriors,
-        quiet=quiet,
+        quiescent=quiescent,
         attrs={**baseline.attrs, "recalibrated": changed},
         spectrum=power,
         settings=state.settings,
@@ -165,14 +165,14 @@ def refer_to_kept_noise(
     if noise.attrs.get("source") != "calibrated":
         return list(fitted)
     recalibrated = noise.attrs.get("recalibrated", ())
-    quiet = dict(zip(noise["axis"].values.tolist(), noise["quiet"].values, strict=True))
+    quiescent = dict(zip(noise["axis"].values.tolist(), noise["quiet"].values, strict=True))
     out = []
     for effect_fit in fitted:
         kept_axes = [axis for axis in effect_fit.axes if axis not in recalibrated]
         if effect_fit.effect is None or effect_fit.effect.stage != "noise" or not kept_axes:
             out.append(effect_fit)
             continue
-        at_rest = quiet[kept_axes[0]]
+        at_rest = quiescent[kept_axes[0]]
         means = {
             role: float(np.nanmean(blocks[f"channel_{name}"].values[at_rest]))
             for role, name in find_drivers(effect_fit.effect).items()

@@ -145,10 +145,10 @@ class SineSearch:
         usable = (spectrum.used > 0) & spectrum.total.any(axis=1)  # a constant axis has no noise
         if frequency.size < _MIN_LEVELS * width or not usable.any():
             return None
-        of_bands = spectrum.equal_count()
+        band_counts = spectrum.equal_count()
         count, median = (
             np.repeat(part, spectrum.widths, axis=1)[:, inside]
-            for part in (of_bands, gammaincinv(of_bands, 0.5) / of_bands)
+            for part in (band_counts, gammaincinv(band_counts, 0.5) / band_counts)
         )
         mean = spectrum.total[:, inside] / np.maximum(spectrum.used, 1)[:, None]
         power = np.where(usable[:, None], mean, 1.0)
