@@ -15,6 +15,9 @@ import xarray as xr
 
 from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.baseline.expected_statistics import (
+    B_TERM,
+    K_TERM,
+    N_TERM,
     NOISE,
     common_variance,
     noise_powers,
@@ -23,6 +26,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     white_variance,
 )
 from gyrostab.diagnose.baseline.posterior import (
+    MIN_WHITE_SHARE,
     BandPowers,
     Posterior,
     average_blocks,
@@ -52,6 +56,10 @@ _SHARE_ABOVE = 1e-3
 #: Bands that the noise terms are fitted to, with any spectral shape.
 MIN_BANDS = 6
 _MIN_LOW_SHAPE = 20.0  # of the lowest bands, which define the white noise of a block mean
+_MIN_CELL_PROBABILITY = 1e-12  # of a point of the coarse grid, so that its logarithm is finite
+#: Least factor that a filter or an effect on the lowest band has on the white variance of a mean.
+#: Design choice: no mean is exact.
+MIN_MEAN_NOISE_FACTOR = 0.1
 
 
 def _mean_noise_excess(
@@ -91,20 +99,23 @@ def _coarse_grids(
     slow drift of such a null record would be evidence of an effect. All axes have as many values as
     the one that needs most.
     """
-    visible = [visible_coefficients(density, span) for density in densities]
+    visible = [visible_coefficients(density, span) for density in densities]  # K, B
     values = {}
-    for column, term in enumerate("BK"):
+    for column, term in enumerate("BK"):  # as in `Posterior.slow`
         slow = [np.sqrt(posterior.slow[:, column]) for posterior in posteriors]
-        places = [
-            (float(np.median(draws)), limits[1 - column])
+        centres_and_scales = [
+            (float(np.median(draws)), limits["KB".index(term)])
             for draws, limits in zip(slow, visible, strict=True)
         ]
         excess = max(
-            np.quantile(draws, 1.0 - _SHARE_ABOVE) / grid_values(term, *place)[-1]
-            for draws, place in zip(slow, places, strict=True)
+            np.quantile(draws, 1.0 - _SHARE_ABOVE) / grid_values(term, *centre_and_scale)[-1]
+            for draws, centre_and_scale in zip(slow, centres_and_scales, strict=True)
         )
         more = round(2.0 * math.log10(max(excess, 1.0)))
-        values[term] = [grid_values(term, *place, more=more) for place in places]
+        values[term] = [
+            grid_values(term, *centre_and_scale, more=more)
+            for centre_and_scale in centres_and_scales
+        ]
     return [_weigh_grid(*axis) for axis in zip(posteriors, values["K"], values["B"], strict=True)]
 
 
@@ -114,7 +125,7 @@ def _weigh_grid(posterior: Posterior, K: Floats, B: Floats) -> tuple[Floats, Flo
     for fine, coarse in ((posterior.K, K), (posterior.B, B)):
         between = np.sqrt(coarse[1:-1] * coarse[2:])
         place.append(np.searchsorted(np.concatenate([[coarse[1] / np.sqrt(3.0)], between]), fine))
-    mass = np.full((K.size, B.size), 1e-12)
+    mass = np.full((K.size, B.size), _MIN_CELL_PROBABILITY)
     np.add.at(mass, tuple(place), posterior.weight)
     grid = [values.ravel() for values in np.meshgrid(K, B, indexing="ij")]
     return grid[0], grid[1], np.log(mass.ravel() / mass.sum())
@@ -320,8 +331,16 @@ def assemble_baseline(
 ) -> xr.Dataset:
     """Assemble the noise of all axes as the Dataset described in `calibrate_noise`.
 
+    Every baseline is made here: of calibrated noise, of a model, or of a simulated log.
+
     Parameters
     ----------
+    posteriors : list of Posterior
+        Noise of each axis.
+    quiescent : ndarray of bool, shape (axis, block)
+        Blocks that it is calibrated on.
+    attrs : mapping
+        Attributes of the baseline.
     known_mean : ndarray, shape (axis, block), optional
         Known means of effects [degree hour-1].
     spectrum : ndarray, shape (axis, block, band), optional
@@ -329,34 +348,16 @@ def assemble_baseline(
     """
     columns = noise_powers(blocks)
     square = np.stack([posterior.square for posterior in posteriors])
-    noise = sum_noise(columns, square)
-    expected = noise if spectrum is None else spectrum
-    power, shape = blocks["power"].values, blocks["shape"].values
-    floor = np.array([1e-3 * levels.min() / HOUR for levels in expected])
-    squares_for_means, spectrum_of_means = square.copy(), expected.copy()
-    for row, posterior in enumerate(posteriors):
-        if posterior.squares_for_means is not None:
-            squares_for_means[row] = posterior.squares_for_means
-            spectrum_of_means[row] *= columns[row] @ posterior.squares_for_means / noise[row]
-    squares_for_means[:, 1] = np.maximum(squares_for_means[:, 1], floor)
-    white = white_variance(blocks, squares_for_means)
-    white = white * np.maximum(expected[..., 0] / noise[..., 0], 0.1)
-    variance = white * np.stack(
-        [
-            _mean_noise_excess(*arrays, settings)
-            for arrays in zip(power, shape, spectrum_of_means, quiescent, strict=True)
-        ]
+    expected = sum_noise(columns, square) if spectrum is None else spectrum
+    floor = np.array([MIN_WHITE_SHARE * levels.min() / HOUR for levels in expected])  # of N^2
+    white, excess = _variance_of_means(
+        blocks, posteriors, columns, expected, floor, quiescent, settings
     )
     span = blocks.sizes["block"] * float(blocks.attrs["block_s"])
-    densities = np.maximum([posterior.square[1] for posterior in posteriors], floor) * HOUR
+    densities = np.maximum(square[:, N_TERM], floor) * HOUR
     grid_K, grid_B, grid_weight = np.stack(_coarse_grids(posteriors, densities, span), axis=1)
     common, shape_alone = common_variance(blocks)
-    # without R; B and K are those of the block means
-    roots = [
-        np.sqrt(np.concatenate([posterior.draws[:, :2], posterior.slow], axis=1))
-        for posterior in posteriors
-    ]
-    value, error = np.mean(roots, axis=1), np.std(roots, axis=1)
+    value, error = _average_coefficients(posteriors)
     ramp_error = _ramp_error(blocks, white, value, quiescent)
     variables = {
         "coefficient": np.pad(value, ((0, 0), (0, 1))),
@@ -364,7 +365,7 @@ def assemble_baseline(
         "quiet": quiescent,
         "spectrum": expected,
         "known_mean": np.zeros(quiescent.shape) if known_mean is None else known_mean,
-        "mean_variance": variance,
+        "mean_variance": white * excess,
         "angle_variance": np.array([posterior.angle for posterior in posteriors]),
         "common": common,
         "shape_alone": shape_alone,
@@ -401,6 +402,47 @@ def assemble_baseline(
     )
 
 
+def _variance_of_means(
+    blocks: xr.Dataset,
+    posteriors: list[Posterior],
+    columns: Floats,
+    expected: Floats,
+    floor: Floats,
+    quiescent: Bools,
+    settings: Settings,
+) -> tuple[Floats, Floats]:
+    """Return the white variance of the block means, and its excess factor, (axis, block).
+
+    What effects do to the lowest band they do to the white noise of the means. `columns` are those
+    of `noise_powers`, `expected` is the power with effects (axis, block, band), and N^2 of an axis
+    is at least `floor`.
+    """
+    power, shape = blocks["power"].values, blocks["shape"].values
+    squares = np.stack([posterior.square for posterior in posteriors])
+    noise, spectrum = sum_noise(columns, squares), expected.copy()
+    for row, posterior in enumerate(posteriors):
+        if posterior.squares_for_means is not None:
+            squares[row] = posterior.squares_for_means
+            spectrum[row] *= columns[row] @ posterior.squares_for_means / noise[row]
+    squares[:, N_TERM] = np.maximum(squares[:, N_TERM], floor)
+    white = white_variance(blocks, squares)
+    white = white * np.maximum(expected[..., 0] / noise[..., 0], MIN_MEAN_NOISE_FACTOR)
+    excess = [
+        _mean_noise_excess(*arrays, settings)
+        for arrays in zip(power, shape, spectrum, quiescent, strict=True)
+    ]
+    return white, np.stack(excess)
+
+
+def _average_coefficients(posteriors: list[Posterior]) -> tuple[Floats, Floats]:
+    """Return Q, N, B, K and their standard errors, (axis, 4); B and K are those of the means."""
+    roots = [
+        np.sqrt(np.concatenate([posterior.draws[:, :2], posterior.slow], axis=1))
+        for posterior in posteriors
+    ]
+    return np.mean(roots, axis=1), np.std(roots, axis=1)
+
+
 def _ramp_error(blocks: xr.Dataset, white: Floats, value: Floats, quiescent: Bools) -> Floats:
     """Return the error of a ramp fitted to the quiescent means [deg/h^2]."""
     hours = (blocks["begin"].values + blocks["end"].values)[:, None] / (2.0 * HOUR)
@@ -408,7 +450,7 @@ def _ramp_error(blocks: xr.Dataset, white: Floats, value: Floats, quiescent: Boo
     step = float(blocks.attrs["block_s"])
     error = np.full(len(white), np.inf)
     for row, variance in enumerate(white):
-        K, B = value[row, 3:4], value[row, 2:3]
+        K, B = value[row, [K_TERM]], value[row, [B_TERM]]
         information = mean_products(
             hours[:, :0], hours, variance=variance, step=step, K=K, B=B, present=present[row]
         ).gram[0, 0, 0]

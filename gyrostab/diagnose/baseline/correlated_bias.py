@@ -32,7 +32,7 @@ from gyrostab.diagnose.baseline.posterior import (
 )
 from gyrostab.diagnose.evidence.held_out import mean_residual
 from gyrostab.diagnose.evidence.wandering import add_correlated, expected_processes
-from gyrostab.diagnose.predict.condition import fit_powers
+from gyrostab.diagnose.predict.condition import SCORING_STEPS, fit_powers
 from gyrostab.diagnose.predict.linear_model import (
     State,
     band_widths,
@@ -45,9 +45,9 @@ from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.units import HOUR
 
 _MIN_NOISE_SHARE = 0.05  # of the power of Q and N, that effects may leave; design choice
-_SCORING_STEPS = 4  # of Fisher scoring, as in `gyrostab.diagnose.predict.condition`
+
 _MIN_CHANGE = 1e-6  # of the expected powers, from which effects change them; above rounding errors
-_LEVEL_GROUPS = 30  # of blocks of similar power, where effects change it; limits time
+_SEARCH_GROUPS = 30  # of blocks of similar power, where effects change it; limits time
 #: Range of the density of the bias at low frequencies, over that of white noise. Design choice.
 _DENSITY_RATIOS = np.array([0.1, 1e6])
 #: Times at which powers are computed. Between them they are interpolated, to 2e-5 in records of
@@ -116,7 +116,7 @@ class _AxisRecord:
         """Return the expected powers, those of the likeliest Q and N added (Fisher scoring)."""
         columns, least = self.bands.columns[:, :2], _MIN_NOISE_SHARE * self.noise
         expected = np.maximum(self.noise + added, least)
-        for _ in range(_SCORING_STEPS):
+        for _ in range(SCORING_STEPS):
             weighted = columns.T * (self.bands.weight / expected**2)[:, None]
             right = (weighted @ (self.bands.power - added)[..., None])[..., 0]
             square = solve_nonnegative(weighted @ columns, right)
@@ -304,7 +304,7 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
         np.nan_to_num(cells),
         state.weight[row].mean(axis=1),
         chosen,
-        _LEVEL_GROUPS if varies else 1,
+        _SEARCH_GROUPS if varies else 1,
     )
     columns = bands.columns
     bands = BandPowers(bands.power, columns[:, :4], bands.weight)

@@ -25,7 +25,7 @@ from gyrostab.noise import TERMS
 from gyrostab.simulate.model import Model, read_model
 from gyrostab.units import HOUR
 
-_ROUNDS = 20  # of Fisher scoring, which converges quadratically
+_FACTOR_ROUNDS = 20  # of Fisher scoring, which converges quadratically
 _MIN_FACTOR_RATIO = 0.1  # of the factor before: no round may reach zero
 
 
@@ -209,7 +209,7 @@ def _fit_factor(power: Floats, noise: Floats, added: Floats, weight: Floats) -> 
     """Fit ``factor * noise + added`` to gamma-distributed powers; return also the error share."""
     factor = float((weight * power / (noise + added)).sum() / weight.sum())
     information = 0.0
-    for _ in range(_ROUNDS):
+    for _ in range(_FACTOR_ROUNDS):
         expected = factor * noise + added
         information = float((weight * (noise / expected) ** 2).sum())
         change = float((weight * noise * (power - expected) / expected**2).sum()) / information

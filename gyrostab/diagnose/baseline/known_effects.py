@@ -11,6 +11,7 @@ import xarray as xr
 
 from gyrostab.arrays import Array, Bools, Complexes, Floats
 from gyrostab.diagnose.baseline.expected_statistics import (
+    N_TERM,
     NOISE,
     band_columns,
     line_columns,
@@ -101,7 +102,7 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Floats) -> Kn
             if prediction.line is not None and factor.any():
                 narrow.append((effect, rows, power))
         wandering.append((prediction, rows, sizes))
-    white_response = response[:, None, :, NOISE.index("N")]
+    white_response = response[:, None, :, N_TERM]
     noise = np.einsum("fn,afn,abn->abf", band_columns(blocks), response, np.maximum(squares, 0.0))
     spectrum = spread_by_gaps((noise + added * white_response) * noise_left[..., None], blocks)
     variables = _shared_cross(coherent, white_response, blocks)

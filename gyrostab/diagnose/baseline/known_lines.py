@@ -23,7 +23,7 @@ from gyrostab.kernels.spectra.periodogram import ordinates, taper
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.base import Effect
 
-_LEAK_LINES = 100  # on either side, that a line leaks into; limits time
+_LEAKAGE_REACH_LINES = 100  # on either side, that a line leaks into; limits time
 _PLACES_BETWEEN = 4  # positions of a line on either side of a frequency of the spectrum
 _FINER = 2 * _PLACES_BETWEEN  # frequencies for each line
 _PEAK_POINTS = 1000  # within a step of a density
@@ -127,7 +127,7 @@ def _average_over_taper(density: Floats, size: int) -> Floats:
     The density is at the frequencies of `_between_lines`.
     """
     window = np.abs(np.fft.fft(taper(size), size * _FINER)) ** 2
-    reach = min(_LEAK_LINES * _FINER, density.size // 2)
+    reach = min(_LEAKAGE_REACH_LINES * _FINER, density.size // 2)
     window = np.concatenate([window[-reach:], window[: reach + 1]])
     around = np.concatenate([density[::-1], density[:1], density, density[::-1]])
     tapered = np.convolve(around, window / window.sum(), "same")
@@ -154,7 +154,7 @@ def _line_leakage(size: int, apart: float = 0.0) -> tuple[Floats, Floats, Floats
     The offset `apart` from the middle line is in lines.
     """
     weights = taper(size)
-    reach = min(_LEAK_LINES, (ordinates(size) - 1) // 2)
+    reach = min(_LEAKAGE_REACH_LINES, (ordinates(size) - 1) // 2)
     turned = weights * np.exp(2j * np.pi * apart * np.arange(size) / size)
     padded = np.abs(np.fft.fft(turned, size * _FINER)) ** 2 / (size * (weights**2).sum())
     place = np.arange(-reach, reach + 1) * _FINER

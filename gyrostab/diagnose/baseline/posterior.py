@@ -11,6 +11,7 @@ from scipy.special import ndtr, ndtri
 
 from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.baseline.axis_means import AxisMeans
+from gyrostab.diagnose.baseline.expected_statistics import B_TERM, K_TERM, N_TERM
 from gyrostab.diagnose.evidence.wandering import RandomProcesses, no_processes
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.windows import make_windows
@@ -21,7 +22,10 @@ from gyrostab.units import HOUR
 
 #: Number of draws from the posterior of the noise of an axis; limits memory.
 DRAWS = 512
-_MIN_POWER_RATIO = 0.05  # of expected powers that fitted effects may leave; design choice
+#: Smallest N^2 that is resolved, over that which alone gives the smallest power of a band.
+MIN_WHITE_SHARE = 1e-3
+_MIN_DRAWN_SHARE = 0.01  # of the fitted N^2, in a draw: white noise is never absent; design choice
+_MIN_POWER_WITH_EFFECTS = 0.05  # of expected powers that fitted effects may leave; design choice
 _MIN_STEP = 1e-3  # shortest step towards the best fit
 _ROUNDING_SHARE = 1e-12  # rounding error of a log likelihood
 
@@ -104,9 +108,8 @@ def fit_squares(bands: BandPowers) -> tuple[Floats, Floats, Floats]:
     """
     width = bands.columns.shape[1]
     square, normal = np.zeros(width), np.zeros((width, width))
-    square[1] = max(
-        float((bands.weight * bands.rest() / bands.columns[:, 1]).sum() / bands.weight.sum()), 0.0
-    )
+    weighted_squares = bands.weight * bands.rest() / bands.columns[:, N_TERM]
+    square[N_TERM] = max(float(weighted_squares.sum() / bands.weight.sum()), 0.0)
     spectrum = bands.columns @ square if bands.start is None else bands.start
     free_columns, precision = bands.free()
     # Otherwise the likelihood is not that of these powers alone.
@@ -123,7 +126,7 @@ def fit_squares(bands: BandPowers) -> tuple[Floats, Floats, Floats]:
         if free_columns.shape[1] or bands.fixed_power is not None:
             power_of_effects = free_columns @ (to_right - to_noise @ solution)
             next_spectrum = next_spectrum + (bands.power - bands.rest()) + power_of_effects
-            next_spectrum = np.maximum(next_spectrum, _MIN_POWER_RATIO * spectrum)
+            next_spectrum = np.maximum(next_spectrum, _MIN_POWER_WITH_EFFECTS * spectrum)
         if not (next_spectrum > 0.0).all():
             break
         fraction = _choose_step(bands, spectrum, next_spectrum) if has_powers_only else 1.0
@@ -215,19 +218,24 @@ def choose_filter(behind: Sequence[Sequence[tuple[float, float]]], settings: Set
 
 def with_floor(square: Floats, bands: BandPowers) -> Floats:
     """Return squares with the smallest resolved N^2: white noise hides in the smallest power."""
-    least = 1e-3 * max(float(np.min(bands.power)), np.finfo(float).tiny) / HOUR
+    least = MIN_WHITE_SHARE * max(float(np.min(bands.power)), np.finfo(float).tiny) / HOUR
     return np.maximum(square, [0.0, least, 0.0, 0.0])
 
 
 def visible_coefficients(density: float, span: float) -> tuple[float, float]:
-    """Return K and B that the means just show in white noise of a density [degree2 hour-2 Hz-1]."""
+    """Return K and B that the means just show in white noise of a density [degree2 hour-2 Hz-1].
+
+    Their Allan variances, K^2 tau / 3 and 0.44 B^2, are equal to that of the white noise over the
+    whole span.
+    """
     return float(np.sqrt(HOUR * 3.0 * density) / span), float(np.sqrt(density / span / 0.44))
 
 
 def fine_grid(density: float, span: float, step: float) -> tuple[Floats, Floats]:
     """Return values of K and B, from invisible in the means to far above white noise."""
     K, B = visible_coefficients(density, span)
-    top = 300.0 * span / step
+    top = 300.0 * span / step  # last over first K; the last B is 30 times the root of it
+    # six values of K in a decade, and four of B; design choice
     return (
         np.geomspace(0.1 * K, 0.1 * K * top, round(6.0 * np.log10(top))),
         np.geomspace(0.1 * B, 3.0 * B * np.sqrt(top), round(4.0 * np.log10(30.0 * np.sqrt(top)))),
@@ -246,7 +254,7 @@ def _likelihood_of_powers(
     fast_columns = np.concatenate([bands.columns[:, :2], free_columns], axis=1)
     normal = _normal_matrix(fast_columns, weight, precision)
     without_q = _normal_matrix(fast_columns[:, 1:], weight, precision)
-    slow = np.outer(B**2, bands.columns[:, 2]) + np.outer(K**2, bands.columns[:, 3])
+    slow = np.outer(B**2, bands.columns[:, B_TERM]) + np.outer(K**2, bands.columns[:, K_TERM])
     right = (weight * (bands.rest() - slow)) @ fast_columns
     best = np.linalg.solve(normal, right.T).T
     best_without_q = np.linalg.solve(without_q, right[:, 1:].T).T
@@ -255,7 +263,7 @@ def _likelihood_of_powers(
     used = np.where(is_inside[:, None], best, np.pad(best_without_q, ((0, 0), (1, 0))))
     expected = used @ fast_columns.T + slow + (bands.power - bands.rest())
     if free_columns.shape[1] or bands.fixed_power is not None:
-        expected = np.maximum(expected, _MIN_POWER_RATIO * spectrum)
+        expected = np.maximum(expected, _MIN_POWER_WITH_EFFECTS * spectrum)
     likelihood = -(bands.weight * (np.log(expected) + bands.power / expected)).sum(axis=1)
     if free_columns.shape[1]:
         normal = np.linalg.inv(np.linalg.inv(normal)[:2, :2])
@@ -328,9 +336,9 @@ def noise_posterior(
     present = use & np.isfinite(mean)
     rng = np.random.default_rng(0)  # of any axis, so that their order does not matter
     square, information, spectrum = fit_squares(bands)
-    density = HOUR * float(with_floor(square, bands)[1])
-    coarse_K, coarse_B = fine_grid(density, mean.size * step, step)
-    K, B = (axis_values.ravel() for axis_values in np.meshgrid(coarse_K, coarse_B, indexing="ij"))
+    density = HOUR * float(with_floor(square, bands)[N_TERM])
+    K_values, B_values = fine_grid(density, mean.size * step, step)
+    K, B = (points.ravel() for points in np.meshgrid(K_values, B_values, indexing="ij"))
     means = AxisMeans(
         np.where(present, mean, 0.0)[:, None],
         effects,
@@ -344,7 +352,7 @@ def noise_posterior(
     if with_angle is not means:
         means, slow = with_angle, with_angle.log_likelihood(K, B)
     fast, best, normal = _likelihood_of_powers(bands, spectrum, K, B)
-    is_in_grid = square[3] <= K.max() ** 2 and square[2] <= B.max() ** 2
+    is_in_grid = square[K_TERM] <= K.max() ** 2 and square[B_TERM] <= B.max() ** 2
     fast_max = fast.max() if is_in_grid else _log_likelihood(bands, spectrum)
     joined = bool(slow.max() + fast_max - (slow + fast).max() < settings.disagreement_nats)
     log = slow + fast if joined else slow
@@ -352,17 +360,19 @@ def noise_posterior(
     weight /= weight.sum()
     cell = rng.choice(weight.size, DRAWS, p=weight)
     jitter = rng.random((DRAWS, 2)) - 0.5
-    inner = np.exp(2.0 * jitter * np.log([coarse_B[1] / coarse_B[0], coarse_K[1] / coarse_K[0]]))
+    # each draw lies anywhere in its cell of the grid; squares move twice as far as B and K
+    inner = np.exp(2.0 * jitter * np.log([B_values[1] / B_values[0], K_values[1] / K_values[0]]))
     slow_draws = np.stack([B[cell] ** 2, K[cell] ** 2], axis=1) * inner
     scale = np.sqrt(np.diag(information))
     covariance = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
     error = np.sqrt(np.diag(covariance))
     if joined:
-        spread = np.asarray(np.linalg.inv(normal), np.float64)
-        squares = np.concatenate([_draw_near(best[cell], spread, rng), slow_draws], axis=1)
+        fast_covariance = np.asarray(np.linalg.inv(normal), np.float64)
+        fast_draws = _draw_near(best[cell], fast_covariance, rng)
+        squares = np.concatenate([fast_draws, slow_draws], axis=1)
     else:
         squares = _draw_positive(square, information, rng)
-    squares[:, 1] = np.maximum(squares[:, 1], 0.01 * square[1])
+    squares[:, N_TERM] = np.maximum(squares[:, N_TERM], _MIN_DRAWN_SHARE * square[N_TERM])
     return Posterior(
         square, error, K, B, weight, squares, slow_draws, joined, angle=float(means.wander.angle)
     )

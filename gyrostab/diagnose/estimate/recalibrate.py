@@ -14,8 +14,9 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Floats
-from gyrostab.diagnose.baseline.calibrate import assemble_baseline
+from gyrostab.diagnose.baseline.calibrate import MIN_MEAN_NOISE_FACTOR, assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import (
+    N_TERM,
     NOISE,
     noise_powers,
     reduced_shape,
@@ -290,13 +291,15 @@ def _fit_noise(
     bands = _average_powers(power, shape, columns, state.weight[row], axis_effects, chosen)
     square, information, _ = fit_squares(bands)
     assert bands.start is not None
-    plain = float((bands.weight / np.square(bands.start) * bands.columns[:, 1] ** 2).sum())
-    if not information[1, 1] > state.settings.min_information_share * plain or not square[1] > 0.0:
+    white_column = bands.columns[:, N_TERM]
+    without_effects = float((bands.weight / np.square(bands.start) * white_column**2).sum())
+    least_information = state.settings.min_information_share * without_effects
+    if not information[N_TERM, N_TERM] > least_information or not square[N_TERM] > 0.0:
         return None
     square = with_floor(square, bands)
     variance = white_variance(blocks, square[None])[row]
     unfiltered = noise_powers(blocks)[row, :, 0] @ square
-    variance = variance * np.maximum(state.weight[row, :, 0] / unfiltered, 0.1)
+    variance = variance * np.maximum(state.weight[row, :, 0] / unfiltered, MIN_MEAN_NOISE_FACTOR)
     effect_means = np.stack(axis_effects.means, axis=1) if axis_effects.means else None
     return noise_posterior(
         bands, blocks, row, variance, chosen, effect_means, state.settings, wander

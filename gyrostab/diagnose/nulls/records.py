@@ -45,6 +45,8 @@ _KURTOSIS_SAMPLES = 10**6  # simulated sample by sample; limits time
 _MAX_BANDS_APART = 4  # of bands that the taper correlates
 _MIN_BAND_CORRELATION = 0.003  # smaller ones are neglected
 _MAX_COMMON_SHARE = 0.9  # of the scatter of a band that may be common with others
+# Least power of a band without its lines, over that with them. Design choice.
+_MIN_SHARE_WITHOUT_LINES = 0.01
 _MIN_EIGENVALUE = 1e-9  # of a coherence: with gaps it may be negative for nearly equal axes
 
 
@@ -344,7 +346,8 @@ def _draw_lines(setup: _NullSetup, squares: Floats, rng: np.random.Generator) ->
         if "line_spectrum" in baseline:
             columns = baseline["columns"].values[axis, chosen]
             noise = (columns @ baseline["square"].values[axis]).mean(axis=0)
-            over = np.maximum(over - baseline["line_spectrum"].values[axis] / noise, 0.01 * over)
+            without_lines = over - baseline["line_spectrum"].values[axis] / noise
+            over = np.maximum(without_lines, _MIN_SHARE_WITHOUT_LINES * over)
         effects = interpolate_bands(over[None], frequency, bands)[0]
         if "line_shape" in baseline:
             effects = effects * baseline["line_shape"].values[axis]

@@ -19,6 +19,7 @@ from gyrostab.kernels.regression.nonnegative import solve_bounded
 
 #: Least fitted power over the expected one. Design choice.
 MIN_POWER_RATIO = 0.2
+SCORING_STEPS = 4  # of Fisher scoring
 
 
 def condition_on(state: State, components: list[Component]) -> State:
@@ -120,9 +121,6 @@ def drop_changed_tails(
     return out
 
 
-_ROUNDS = 4  # steps of Fisher scoring
-
-
 def _fit_sizes(
     expected: Floats, columns: Floats, prior: Floats, low: Floats, power: Floats, shape: Floats
 ) -> Floats:
@@ -137,7 +135,7 @@ def _fit_sizes(
     columns = columns / size
     good = np.isfinite(power) & np.isfinite(shape)
     fitted, sizes = flat, np.zeros(size.size)
-    for _ in range(_ROUNDS):
+    for _ in range(SCORING_STEPS):
         w = np.where(good, shape / fitted**2, 0.0)
         w = np.where(np.isfinite(w), w, 0.0)
         normal = (columns * w[:, None]).T @ columns + np.diag(prior / size**2)
