@@ -32,6 +32,9 @@ from gyrostab.wording import join_words
 #: Fewest null records: one of them is expected beyond the default level of 1 %.
 MIN_NULL_RECORDS = 100
 _SPAN_EXAMPLE = "2026-03-14T08:00/2026-03-14T08:30, or 0s/30min after the start"
+#: Stack level of the caller of `gyrostab.diagnose` for a warning of a function in `core` that
+#: `_identify_with_delays` calls.
+CALLER_LEVEL = 6
 #: Largest power [deg^2/h] that rounding alone gives a constant rate; noise of any gyro has more.
 MAX_ROUNDING_POWER = 1e-20
 
@@ -148,7 +151,7 @@ def varying_axes(blocks: xr.Dataset) -> list[str]:
             "right column was read"
         )
     for reason in reasons:
-        warnings.warn(f"{reason}: left out of the diagnosis", stacklevel=7)
+        warnings.warn(f"{reason}: left out of the diagnosis", stacklevel=CALLER_LEVEL + 1)
     return varying
 
 
@@ -204,7 +207,7 @@ class NamedBlocks(NamedTuple):
 
     blocks: xr.Dataset
     baseline: xr.Dataset  # what the simulation predicts for the blocks
-    null_records: Callable[[], Iterable[xr.Dataset]]  # the same ones on each call
+    draw_null_records: Callable[[], Iterable[xr.Dataset]]  # the same ones on each call
     #: Effects that explain the blocks without the lines of the baseline.
     identifications: Identifications
 
