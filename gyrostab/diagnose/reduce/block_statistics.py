@@ -25,7 +25,7 @@ MIN_BLOCKS = 24  # fewer are refused: held-out stretches and calibration need th
 _MIN_NEIGHBOUR_RATIO = 2.0  # times expected density from which noise near an order is significant
 
 
-def block_samples(size: int, rate: float, block: Any = None) -> int:
+def choose_block_length(size: int, rate: float, block: Any = None) -> int:
     """Choose the block length: 20 s, less in short records, more beyond 5.6 h; in samples.
 
     The length is a product of small primes. A requested one is a duration, or a number of samples
@@ -38,8 +38,10 @@ def block_samples(size: int, rate: float, block: Any = None) -> int:
 
     Examples
     --------
-    >>> block_samples(360_000, 100.0), block_samples(72_001, 200.0), block_samples(8_641, 100.0)
-    (2000, 800, 100)
+    >>> choose_block_length(360_000, 100.0), choose_block_length(72_001, 200.0)
+    (2000, 800)
+    >>> choose_block_length(8_641, 100.0)
+    100
     """
     if block is None:
         default_length = max(
@@ -115,17 +117,18 @@ def reduce_log(
     """
     check_log(log)
     rate, size = float(log.attrs["sampling_rate_hz"]), count_samples(log)
-    length = block_samples(size, rate, block)
+    length = choose_block_length(size, rate, block)
     work = Accumulator(log, length, size // length, rate)
-    sample_count = work.rows * work.block_count * length
+    sample_count = work.row_count * work.block_count * length
     progress("reducing", sample_count)
     for batch in read_batches(log, length):
         stop = batch.first + batch.values.shape[1]
         if left_out is not None:
-            batch.values[: work.axes][left_out[:, batch.first : stop]] = np.nan
+            batch.values[: work.axis_count][left_out[:, batch.first : stop]] = np.nan
         work.add(batch)
-        progress("reducing", sample_count, work.rows * stop * length)
-    return label_statistics(work, log, restart=duration_seconds(restart_gap, "restart_gap"))
+        progress("reducing", sample_count, work.row_count * stop * length)
+    restart_gap_s = duration_seconds(restart_gap, "restart_gap")
+    return label_statistics(work, log, restart_gap_s=restart_gap_s)
 
 
 def pair_indices(blocks: xr.Dataset) -> Ints:

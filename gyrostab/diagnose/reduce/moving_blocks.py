@@ -26,7 +26,8 @@ MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal law
 #: The means do not move by a few samples that are one quantization step from all others.
 EQUAL_SCATTER, ROUNDING = 1e-3, 1e-9
 REST_ROUNDS = 3  # in which centre and scatter at rest are refined
-_KEPT_STATISTICS = ("mean", "power", "cross")
+#: Variables of moving blocks that are kept as ``measured_<name>``.
+_MEASURED_STATISTICS = ("mean", "power", "cross")
 
 
 def find_moving_blocks(blocks: xr.Dataset, *, settings: Settings = DEFAULTS) -> Bools:
@@ -140,7 +141,7 @@ def without_motion(
     same = f"{blocks.attrs['block_samples']}samples"
     out = reduce_log(log, block=same, restart_gap=restart_gap, left_out=moving, progress=progress)
     out = out.drop_dims(["gap", "restart"]).assign(
-        {f"measured_{name}": blocks[name] for name in _KEPT_STATISTICS}
+        {f"measured_{name}": blocks[name] for name in _MEASURED_STATISTICS}
         | {name: blocks[name] for name in ("gap_begin", "gap_end", "restart_begin", "restart_end")}
     )
     out["moving"] = (

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from gyrostab.arrays import Array, Bools, Floats, Ints
-from gyrostab.kernels.spectra.outliers import HISTOGRAM, departures, histogram_edge, peaks
+from gyrostab.kernels.samples.outliers import HISTOGRAM, departures, histogram_edge, peaks
 
 #: Expected number of false outliers of an axis in a record of Gaussian noise. Design choice.
 EXPECTED_FALSE_OUTLIERS = 0.02
@@ -29,7 +29,7 @@ _NORMAL_MEDIAN_ABS = 0.6745  # median of |x| of a standard normal variable
 
 
 class Peaks(NamedTuple):
-    """Samples of an axis that may be outliers, from `gyrostab.kernels.spectra.outliers.peaks`."""
+    """Samples of an axis that may be outliers, from `gyrostab.kernels.samples.outliers.peaks`."""
 
     block: Ints  # (peak,)
     size: Floats  # (peak,): departure from the neighbours
@@ -214,11 +214,13 @@ def simultaneous_samples(present: Bools) -> dict[tuple[bool, ...], Ints]:
     """
     axes = len(present)
     code = (present * (1 << np.arange(axes, dtype=np.int64))[:, None, None]).sum(axis=0)
-    number_by_kind = {
-        tuple(bool(kind >> axis & 1) for axis in range(axes)): np.count_nonzero(code == kind, -1)
-        for kind in np.unique(code).tolist()
+    number_by_set = {
+        tuple(bool(bits >> axis & 1) for axis in range(axes)): np.count_nonzero(code == bits, -1)
+        for bits in np.unique(code).tolist()
     }
-    return {kind: number_by_kind[kind] for kind in sorted(number_by_kind) if sum(kind) > 1}
+    return {
+        axis_set: number_by_set[axis_set] for axis_set in sorted(number_by_set) if sum(axis_set) > 1
+    }
 
 
 def zeros_beyond_chance(

@@ -13,7 +13,7 @@ from gyrostab.diagnose.reduce.outliers import (
     find_peaks,
     quantization_step,
 )
-from gyrostab.kernels.spectra.outliers import HISTOGRAM, departures
+from gyrostab.kernels.samples.outliers import HISTOGRAM, departures
 
 SIZE, BLOCK, RATE = 18_000, 180, 10.0  # half an hour
 
