@@ -32,7 +32,7 @@ from gyrostab.diagnose.predict.linear_model import (
     with_correlated_powers,
 )
 from gyrostab.diagnose.predict.windows import complex_factors, predict_effect
-from gyrostab.diagnose.reduce.block_statistics import pair_indices
+from gyrostab.diagnose.reduce.schema import pair_indices
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction

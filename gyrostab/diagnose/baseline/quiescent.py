@@ -11,8 +11,7 @@ import xarray as xr
 
 from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.predict.windows import fill_linearly
-from gyrostab.diagnose.reduce.block_statistics import iso
-from gyrostab.diagnose.reduce.schema import weighted_mean
+from gyrostab.diagnose.reduce.schema import format_time, weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError
 from gyrostab.time.stamps import stamp_ns
@@ -250,4 +249,7 @@ def find_quiescent_spans(blocks: xr.Dataset, quiescent: Bools) -> list[list[str]
         -1, 2
     )
     begin, end = blocks["begin"].values, blocks["end"].values
-    return [[iso(blocks, begin[first]), iso(blocks, end[last - 1])] for first, last in edges]
+    return [
+        [format_time(blocks, begin[first]), format_time(blocks, end[last - 1])]
+        for first, last in edges
+    ]

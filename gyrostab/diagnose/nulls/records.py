@@ -20,7 +20,7 @@ from gyrostab.diagnose.evidence.sample_counts import kurtosis_moments
 from gyrostab.diagnose.evidence.spectral_lines import interpolate_bands
 from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.predict.linear_model import unspread_share
-from gyrostab.diagnose.reduce.block_statistics import pair_indices
+from gyrostab.diagnose.reduce.schema import pair_indices
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.diagnose.statistics.base import NullDraw
 from gyrostab.diagnose.statistics.cross_spectrum import draw_coherency

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from gyrostab.arrays import Array, Floats
+from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.noise import LAWS, TERMS
 from gyrostab.units import INNER
 
@@ -239,6 +239,24 @@ def axis_values(dataset: xr.Dataset, name: str, axis: str | int) -> Floats:
     row = axis if isinstance(axis, int) else dataset.variables["axis"].values.tolist().index(axis)
     variable = dataset.variables[name]
     return np.asarray(np.moveaxis(variable.values, variable.dims.index("axis"), 0)[row])
+
+
+def pair_indices(blocks: xr.Dataset) -> Ints:
+    """Return the indices of the first and of the second axes of all pairs, (2, pair)."""
+    axes = blocks["axis"].values.tolist()
+    sides = [[axes.index(axis) for axis in blocks[name].values] for name in ("first", "second")]
+    return np.array(sides, np.int64)
+
+
+def read_as_measured(blocks: xr.Dataset, name: str) -> xr.DataArray:
+    """Return a variable of the block statistics as measured, including what motion left out."""
+    return blocks[f"measured_{name}"] if f"measured_{name}" in blocks else blocks[name]
+
+
+def format_time(blocks: xr.Dataset, seconds: float) -> str:
+    """Write a time [s since the start of the record] as ISO 8601."""
+    start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
+    return f"{(start + np.timedelta64(round(seconds * 1e9), 'ns')).astype('datetime64[ms]')}Z"
 
 
 def weighted_mean(values: Array, weight: Floats, axis: int = 0) -> tuple[Array, Floats]:

@@ -24,7 +24,7 @@ from gyrostab.diagnose.evidence.products import axis_noise, mean_products
 from gyrostab.diagnose.identify.examination import Identifications
 from gyrostab.diagnose.identify.identification import Selection, components_of
 from gyrostab.diagnose.predict.candidates import Component
-from gyrostab.diagnose.reduce.block_statistics import pair_indices
+from gyrostab.diagnose.reduce.schema import pair_indices
 from gyrostab.diagnose.result.attribution import active_blocks
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.allan_surface import allan_surface

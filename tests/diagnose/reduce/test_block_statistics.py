@@ -9,11 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from gyrostab.diagnose.reduce.block_statistics import (
-    choose_block_length,
-    noise_at_orders,
-    reduce_log,
-)
+from gyrostab.diagnose.reduce.block_statistics import choose_block_length, reduce_log
+from gyrostab.diagnose.reduce.rotation_orders import noise_at_orders
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.spectra.periodogram import band_covariance, band_edges, ordinates, taper

@@ -14,12 +14,13 @@ from gyrostab.diagnose.estimate.unexplained_motion import find_unexplained_motio
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.windows import make_windows
-from gyrostab.diagnose.reduce.block_statistics import measured, reduce_log
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.moving_blocks import (
     find_moving_blocks,
     find_moving_blocks_of_axis,
     without_motion,
 )
+from gyrostab.diagnose.reduce.schema import read_as_measured
 from gyrostab.diagnose.result.tables import motion_mismatches
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic
@@ -114,8 +115,8 @@ def test_motion_is_left_out_on_its_axis_and_kept_as_measured(reduced):
     assert np.isnan(rest["mean"].values[moving]).all()
     assert np.isnan(rest["power"].values[moving]).all()
     np.testing.assert_array_equal(rest["mean"].values[:2], whole["mean"].values[:2])
-    np.testing.assert_array_equal(measured(rest, "mean"), whole["mean"])
-    np.testing.assert_array_equal(measured(rest, "cross"), whole["cross"])
+    np.testing.assert_array_equal(read_as_measured(rest, "mean"), whole["mean"])
+    np.testing.assert_array_equal(read_as_measured(rest, "cross"), whole["cross"])
     np.testing.assert_array_equal(make_windows(rest, {}).own["z"], whole["mean"].sel(axis="z"))
     assert rest.sizes["gap"] == whole.sizes["gap"]
 
