@@ -11,6 +11,7 @@ import xarray as xr
 
 from gyrostab.arrays import Array, Bools, Complexes, Floats
 from gyrostab.diagnose.baseline.expected_statistics import (
+    N_TERM,
     NOISE,
     band_columns,
     line_columns,
@@ -32,7 +33,7 @@ from gyrostab.diagnose.predict.linear_model import (
     with_correlated_powers,
 )
 from gyrostab.diagnose.predict.windows import complex_factors, predict_effect
-from gyrostab.diagnose.reduce.block_statistics import pair_indices
+from gyrostab.diagnose.reduce.schema import pair_indices
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction
@@ -40,7 +41,8 @@ from gyrostab.physics.sampling import LoggerFilter
 from gyrostab.simulate.model import Model
 from gyrostab.units import HOUR
 
-EVERYWHERE = "lattice"  # the mark of every sample: calibrated noise includes what it does
+#: Mark of a quantization grid, which every sample has: calibrated noise includes what it does.
+GRID_MARK = "lattice"
 
 
 class KnownEffects(NamedTuple):
@@ -54,7 +56,7 @@ class KnownEffects(NamedTuple):
     #: Further variables of `gyrostab.diagnose.reduce.schema.BASELINE`, if there are any: the
     #: cross-spectrum, lines at full resolution, and random processes in the means.
     variables: dict[str, Array]
-    left_out: list[str]  # effects that also show elsewhere
+    shown_elsewhere: list[str]  # effects that also show elsewhere
 
 
 def expect_known_effects(blocks: xr.Dataset, model: Model, square: Floats) -> KnownEffects:
@@ -68,22 +70,22 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Floats) -> Kn
     axes = [str(axis) for axis in blocks["axis"].values]
     shape = (len(axes), blocks.sizes["block"], blocks.sizes["band"])
     mean = np.zeros(shape[:2])
-    left = np.ones(shape[:2])  # share of the noise
+    noise_left = np.ones(shape[:2])  # share of the noise
     squares = np.repeat(square[:, None], shape[1], axis=1)
     # factors of filters on the noise terms, (axis, band, term)
     added, response = np.zeros(shape), np.ones((shape[0], shape[2], len(NOISE)))
     line_powers: list[LinePower] = []
     shared_powers: list[tuple[Complexes, Floats]] = []  # factor of each axis, and the density
     processes_on_rows: list[ProcessesOnRows] = []
-    left_out = []
+    shown_elsewhere = []
     for effect, rows in _effects_on_rows(model, axes):
-        of_effect = tuple(axes[row] for row in rows)
-        sizes = partial(effect.expand_to_axes, axes=of_effect)
-        prediction = with_correlated_powers(predict_effect(effect, blocks, of_effect), blocks)
-        has_anomalous_samples = bool({*prediction.marks} - {EVERYWHERE})
+        axis_names = tuple(axes[row] for row in rows)
+        sizes = partial(effect.expand_to_axes, axes=axis_names)
+        prediction = with_correlated_powers(predict_effect(effect, blocks, axis_names), blocks)
+        has_anomalous_samples = bool({*prediction.marks} - {GRID_MARK})
         if has_anomalous_samples or _shows_elsewhere(prediction):
-            left_out.append(effect.name)
-        left[rows] *= _share_left(effect, model, rows, blocks)
+            shown_elsewhere.append(effect.name)
+        noise_left[rows] *= _share_left(effect, model, rows, blocks)
         if has_anomalous_samples or _switches_slowly(prediction, blocks):
             continue  # such blocks are found and left out
         for name, values in prediction.mean.items():
@@ -101,9 +103,9 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Floats) -> Kn
             if prediction.line is not None and factor.any():
                 line_powers.append(LinePower(effect, rows, power))
         processes_on_rows.append(ProcessesOnRows(prediction, rows, sizes))
-    white_response = response[:, None, :, NOISE.index("N")]
+    white_response = response[:, None, :, N_TERM]
     noise = np.einsum("fn,afn,abn->abf", band_columns(blocks), response, np.maximum(squares, 0.0))
-    spectrum = spread_by_gaps((noise + added * white_response) * left[..., None], blocks)
+    spectrum = spread_by_gaps((noise + added * white_response) * noise_left[..., None], blocks)
     variables = _shared_cross(shared_powers, white_response, blocks)
     if (response != 1.0).any():
         variables["line_noise"] = _filtered_lines(model, square, blocks)
@@ -111,7 +113,7 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Floats) -> Kn
         variables |= expect_lines(blocks, line_powers, white_response[:, 0])
     processes, power = random_means(processes_on_rows, shape)
     white_share = 1.0 - power / np.maximum(spectrum[..., 0], np.finfo(float).tiny)
-    return KnownEffects(mean, spectrum, white_share, variables | processes, left_out)
+    return KnownEffects(mean, spectrum, white_share, variables | processes, shown_elsewhere)
 
 
 def _effects_on_rows(model: Model, axes: list[str]) -> Iterator[tuple[Effect, list[int]]]:
@@ -136,7 +138,7 @@ def _filtered_lines(model: Model, square: Floats, blocks: xr.Dataset) -> Floats:
     return np.asarray(np.einsum("lt,alt,at->al", columns, factor, square))
 
 
-def filtered_blocks(blocks: xr.Dataset, model: Model) -> xr.Dataset:
+def with_filtered_shapes(blocks: xr.Dataset, model: Model) -> xr.Dataset:
     """Return blocks with the degrees of freedom that powers have behind the filters of a model.
 
     Where some lines of a band dominate, its power has those of fewer lines.
@@ -162,7 +164,7 @@ def _share_left(effect: Effect, model: Model, rows: list[int], blocks: xr.Datase
     for place, row in enumerate(rows):
         variance = model.coefficients(str(blocks["axis"].values[row]))["N"] ** 2 * HOUR * rate
         mean = blocks["mean"].values[row]
-        share[place] = undo_transfer(effect.transfer, mean, variance, known=True).share
+        share[place] = undo_transfer(effect.transfer, mean, variance, variance_is_before=True).share
     return share
 
 
@@ -262,7 +264,7 @@ def _shared_cross(
     return {"cross": spread_by_gaps(shared, blocks, "pair")} if shared.any() else {}
 
 
-def expect_known_motion(
+def find_blocks_with_known_motion(
     blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
 ) -> Bools:
     """Find the blocks in which a known mean moves far above its noise, (axis, block).
@@ -279,7 +281,7 @@ def remove_known_motion(
     blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
 ) -> xr.Dataset:
     """Drop powers, kurtosis and cross-spectra of blocks in which a known mean moves."""
-    moving = expect_known_motion(blocks, baseline, settings=settings)
+    moving = find_blocks_with_known_motion(blocks, baseline, settings=settings)
     if not moving.any():
         return blocks
     still = xr.DataArray(~moving, dims=("axis", "block"))

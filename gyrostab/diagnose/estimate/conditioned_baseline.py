@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Complexes
-from gyrostab.diagnose.baseline.known_effects import EVERYWHERE
+from gyrostab.diagnose.baseline.known_effects import GRID_MARK
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.identify.selections import (
@@ -38,7 +38,7 @@ from gyrostab.physics.registry import effects
 def predict_baseline(
     identifications: Identifications,
     baseline: xr.Dataset,
-    known: Bools | None = None,
+    training: Bools | None = None,
     *,
     left_out: Sequence[Selection] = (),
 ) -> xr.Dataset:
@@ -48,7 +48,7 @@ def predict_baseline(
     ----------
     identifications : Identifications
         The effects, with those that were expected; their nuisance parameters are kept.
-    known : ndarray of bool, shape (block,), optional
+    training : ndarray of bool, shape (block,), optional
         Blocks that the sizes are fitted to; all by default.
     left_out : sequence of Selection, optional
         Effects that are fitted with the others and then taken out again. What a low-pass removed
@@ -62,7 +62,9 @@ def predict_baseline(
     """
     blocks = identifications.state.blocks
     keep = (
-        np.ones(blocks.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
+        np.ones(blocks.sizes["block"], np.bool_)
+        if training is None
+        else np.asarray(training, np.bool_)
     )
     usable_blocks = blocks.copy()
     for name in ("mean", "power", "cross"):
@@ -74,8 +76,8 @@ def predict_baseline(
     states = conditioned_states(state, identified)
     for identification, state in zip(identified, states, strict=True):
         for place, columns in state.given.items():
-            known_of = is_left_out.setdefault(place, [])
-            known_of += [identification in left_out] * (len(columns) - len(known_of))
+            flags = is_left_out.setdefault(place, [])
+            flags += [identification in left_out] * (len(columns) - len(flags))
     spectrum = state.expected_power.copy()
     for row, axis in enumerate(state.axes):
         places = (("power", axis), ("added_power", axis))  # as in `State.power_columns`
@@ -127,11 +129,13 @@ def _cross_spectra(components: Sequence[Component], state: State) -> Complexes:
 
 
 def expected_baseline(
-    identifications: Identifications, baseline: xr.Dataset, known: Bools | None = None
+    identifications: Identifications, baseline: xr.Dataset, training: Bools | None = None
 ) -> xr.Dataset:
-    """Return the baseline with the expected effects only, fitted to the `known` blocks."""
+    """Return the baseline with the expected effects only, fitted to the training blocks."""
     return (
-        predict_baseline(replace(identifications, identified=(), unidentified=()), baseline, known)
+        predict_baseline(
+            replace(identifications, identified=(), unidentified=()), baseline, training
+        )
         if identifications.expected
         else baseline
     )
@@ -169,7 +173,7 @@ def add_outlier_power(
         prediction = effect_fit.effect.explain(
             replace(make_windows(blocks, {}), axes=tuple(effect_fit.axes))
         )
-        if EVERYWHERE in prediction.marks:
+        if GRID_MARK in prediction.marks:
             continue
         for name, density in prediction.spectrum.items():
             added[rows] += getattr(effect_fit.effect, name) ** 2 * density

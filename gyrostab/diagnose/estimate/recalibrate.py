@@ -14,8 +14,9 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Floats
-from gyrostab.diagnose.baseline.calibrate import assemble_baseline
+from gyrostab.diagnose.baseline.calibrate import MIN_MEAN_NOISE_FACTOR, assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import (
+    N_TERM,
     NOISE,
     noise_powers,
     reduced_shape,
@@ -23,7 +24,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
 )
 from gyrostab.diagnose.baseline.known_effects import ProcessesOnRows, random_means
 from gyrostab.diagnose.baseline.posterior import (
-    Fit,
+    BandPowers,
     Posterior,
     average_groups,
     fit_squares,
@@ -49,9 +50,9 @@ LEVEL_GROUPS = 150  # of blocks of similar level, over which powers are averaged
 class AxisEffects:
     """What the effects do on one axis."""
 
-    known: Floats  # (block, band): power of fixed size
+    fixed_power: Floats  # (block, band): power of fixed size
     response: Floats  # (band, term): factor of the noise
-    doubt: float  # relative error of `known`
+    doubt: float  # relative error of `fixed_power`
     free: list[Floats] = field(default_factory=list)  # (block, band): power per unit of a free size
     means: list[Floats] = field(default_factory=list)  # (block,): means per unit of a free size
 
@@ -60,7 +61,7 @@ def recalibrate(
     identifications: Identifications,
     baseline: xr.Dataset,
     fitted: Sequence[Fitted],
-    known: Bools | None = None,
+    training: Bools | None = None,
 ) -> xr.Dataset:
     """Calibrate the noise with the identified effects in the model, those of free size free.
 
@@ -71,12 +72,17 @@ def recalibrate(
 
     The baseline that the identification started from is returned as it is unless it was calibrated
     on the recording. The new one has the steady random processes of the effects in the means;
-    ``attrs["recalibrated"]`` lists its axes. Only blocks `known` (block,) are used, by default all.
+    ``attrs["recalibrated"]`` lists its axes. Only the blocks `training` (block,) are used, by
+    default all.
     """
     if baseline.attrs.get("source") != "calibrated" or not identifications.identified:
         return baseline
     blocks = identifications.state.blocks
-    use = np.ones(blocks.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
+    use = (
+        np.ones(blocks.sizes["block"], np.bool_)
+        if training is None
+        else np.asarray(training, np.bool_)
+    )
     state = condition_on_selections(
         identifications.state_without_effects(baseline), identifications.identified
     )
@@ -85,7 +91,7 @@ def recalibrate(
     columns = noise_powers(blocks)
     processes = _find_processes(fitted, blocks)
     with_processes = baseline.assign(processes)
-    changed, quiet = [], baseline["quiet"].values.copy()
+    changed, quiescent = [], baseline["quiet"].values.copy()
     for row, axis in enumerate(state.axes):
         axis_effects = _collect_effects(identifications, baseline, fitted, axis)
         posterior = None
@@ -94,21 +100,21 @@ def recalibrate(
             has_unidentified = any(
                 axis in selection.axes for selection in identifications.unidentified
             )
-            chosen = use & ~state.masked[row] & (quiet[row] if has_unidentified else True)
+            chosen = use & ~state.masked[row] & (quiescent[row] if has_unidentified else True)
             wander = expected_processes(with_processes, row)
             posterior = _fit_noise(state, row, axis_effects, chosen, wander)
             if posterior is not None:
                 changed.append(axis)
-                quiet[row] = chosen
+                quiescent[row] = chosen
                 columns[row] = noise_powers(blocks, axis_effects.response)[row]
-                power[row] = columns[row] @ posterior.square + axis_effects.known
+                power[row] = columns[row] @ posterior.square + axis_effects.fixed_power
         posteriors.append(_kept_posterior(baseline, row) if posterior is None else posterior)
     if not changed:
         return baseline
     out = assemble_baseline(
         blocks,
         posteriors,
-        quiet=quiet,
+        quiescent=quiescent,
         attrs={**baseline.attrs, "recalibrated": changed},
         spectrum=power,
         settings=state.settings,
@@ -162,14 +168,14 @@ def refer_to_kept_noise(
     if noise.attrs.get("source") != "calibrated":
         return list(fitted)
     recalibrated = noise.attrs.get("recalibrated", ())
-    quiet = dict(zip(noise["axis"].values.tolist(), noise["quiet"].values, strict=True))
+    quiescent = dict(zip(noise["axis"].values.tolist(), noise["quiet"].values, strict=True))
     out = []
     for effect_fit in fitted:
         kept_axes = [axis for axis in effect_fit.axes if axis not in recalibrated]
         if effect_fit.effect is None or effect_fit.effect.stage != "noise" or not kept_axes:
             out.append(effect_fit)
             continue
-        at_rest = quiet[kept_axes[0]]
+        at_rest = quiescent[kept_axes[0]]
         means = {
             role: float(np.nanmean(blocks[f"channel_{name}"].values[at_rest]))
             for role, name in find_drivers(effect_fit.effect).items()
@@ -219,10 +225,10 @@ def _collect_effects(
         touched |= bool(components)
         for component in components:
             if not component.is_filter:
-                known, free, means = component.statistic.noise_shares(
+                fixed_power, free, means = component.statistic.noise_shares(
                     component, axis, start, identifications.state.expected_power
                 )
-                out.known += known
+                out.fixed_power += fixed_power
                 out.free += [np.broadcast_to(column, shape) for column in free]
                 out.means += means
         effect_fit = next(
@@ -237,7 +243,7 @@ def _collect_effects(
             component.statistic.has_power_of_effect(component, identifications.state)
             for component in components
         ):
-            out.known += _effect_power(effect_fit.effect, blocks, axis)
+            out.fixed_power += _effect_power(effect_fit.effect, blocks, axis)
             errors = [
                 2.0 * estimate.stderr / abs(estimate.value)
                 for estimate in effect_fit.parameters.values()
@@ -291,18 +297,24 @@ def _fit_noise(
     if chosen.sum() < MIN_BLOCKS:
         return None
     columns = noise_powers(blocks, axis_effects.response)[row]
-    fit = _average_powers(power, shape, columns, state.expected_power[row], axis_effects, chosen)
-    square, information, _ = fit_squares(fit)
-    assert fit.start is not None
-    plain = float((fit.weight / np.square(fit.start) * fit.columns[:, 1] ** 2).sum())
-    if not information[1, 1] > state.settings.min_information_share * plain or not square[1] > 0.0:
+    bands = _average_powers(power, shape, columns, state.expected_power[row], axis_effects, chosen)
+    square, information, _ = fit_squares(bands)
+    assert bands.start is not None
+    white_column = bands.columns[:, N_TERM]
+    without_effects = float((bands.weight / np.square(bands.start) * white_column**2).sum())
+    least_information = state.settings.min_information_share * without_effects
+    if not information[N_TERM, N_TERM] > least_information or not square[N_TERM] > 0.0:
         return None
-    square = with_floor(square, fit)
+    square = with_floor(square, bands)
     variance = white_variance(blocks, square[None])[row]
     unfiltered = noise_powers(blocks)[row, :, 0] @ square
-    variance = variance * np.maximum(state.expected_power[row, :, 0] / unfiltered, 0.1)
+    variance = variance * np.maximum(
+        state.expected_power[row, :, 0] / unfiltered, MIN_MEAN_NOISE_FACTOR
+    )
     effect_means = np.stack(axis_effects.means, axis=1) if axis_effects.means else None
-    return noise_posterior(fit, blocks, row, variance, chosen, effect_means, state.settings, wander)
+    return noise_posterior(
+        bands, blocks, row, variance, chosen, effect_means, state.settings, wander
+    )
 
 
 def _average_powers(
@@ -312,21 +324,25 @@ def _average_powers(
     expected: Floats,
     axis_effects: AxisEffects,
     chosen: Bools,
-) -> Fit:
+) -> BandPowers:
     """Average the powers over blocks of similar level."""
     free_columns = [
         column / max(float(np.abs(column).max()), 1e-300) for column in axis_effects.free
     ]
-    effect_columns = np.stack([axis_effects.known, expected, *free_columns], axis=-1)
+    effect_columns = np.stack([axis_effects.fixed_power, expected, *free_columns], axis=-1)
     cells = np.nan_to_num(np.concatenate([columns, effect_columns], axis=-1))
     level = np.log(expected.mean(axis=1))
-    fit = average_groups(power, shape, cells, level, chosen, LEVEL_GROUPS)
-    columns, (known, start), free = fit.columns[:, :4], fit.columns[:, 4:6].T, fit.columns[:, 6:]
+    bands = average_groups(power, shape, cells, level, chosen, LEVEL_GROUPS)
+    columns, (fixed_power, start), free = (
+        bands.columns[:, :4],
+        bands.columns[:, 4:6].T,
+        bands.columns[:, 6:],
+    )
     precision = np.zeros(free.shape[1])
-    if np.any(known > 0.0):  # the predicted power has an error too
-        free = np.concatenate([free, known[:, None]], axis=1)
+    if np.any(fixed_power > 0.0):  # the predicted power has an error too
+        free = np.concatenate([free, fixed_power[:, None]], axis=1)
         precision = np.append(precision, 1.0 / axis_effects.doubt**2)
-    return Fit(fit.power, columns, fit.weight, known, free, precision, start)
+    return BandPowers(bands.power, columns, bands.weight, fixed_power, free, precision, start)
 
 
 def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identifications:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,17 +88,10 @@ def null_scores(
 ) -> NullScores:
     """Collect the scores of null records chunk by chunk, keeping only extreme scores."""
     gathered: dict[str, _ScoreSums] = {}
-    for chunk in nulls:
-        powers = max(chunk["power"].size, chunk["line_power"].size) // chunk.sizes["record"]
-        size = max(_MIN_RECORDS_AT_ONCE, _POWERS_AT_ONCE // powers)
-        for first in range(0, chunk.sizes["record"], size):
-            part = chunk.isel(record=slice(first, first + size))
-            for statistic in STATISTICS:
-                scores = statistic.score(part, baseline)
-                if scores is not None:
-                    if statistic.name not in gathered:
-                        gathered[statistic.name] = _ScoreSums(scores, settings.pooled_records)
-                    gathered[statistic.name].add(scores)
+    for name, scores in _score_parts(nulls, baseline):
+        if name not in gathered:
+            gathered[name] = _ScoreSums(scores, settings.pooled_records)
+        gathered[name].add(scores)
     statistics = {}
     largest = {}
     for name, sums in gathered.items():
@@ -112,6 +105,21 @@ def null_scores(
         np.max(list(largest.values()), axis=0), settings.tail_share, _MIN_TAIL_SCALE
     )
     return NullScores(statistics, family, settings)
+
+
+def _score_parts(
+    nulls: Iterable[xr.Dataset], baseline: xr.Dataset
+) -> Iterator[tuple[str, xr.Dataset]]:
+    """Yield the name of each statistic with its scores of some null records, for all records."""
+    for chunk in nulls:
+        powers = max(chunk["power"].size, chunk["line_power"].size) // chunk.sizes["record"]
+        size = max(_MIN_RECORDS_AT_ONCE, _POWERS_AT_ONCE // powers)
+        for first in range(0, chunk.sizes["record"], size):
+            part = chunk.isel(record=slice(first, first + size))
+            for statistic in STATISTICS:
+                scores = statistic.score(part, baseline)
+                if scores is not None:
+                    yield statistic.name, scores
 
 
 def standardise(scores: xr.Dataset, null: StatisticNull) -> Floats:

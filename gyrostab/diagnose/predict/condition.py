@@ -114,9 +114,9 @@ def drop_changed_tails(
         np.abs(level - np.median(level, axis=1, keepdims=True)) > settings.max_level_step
     )
     out = blocks.copy()
-    left_out: dict[str, tuple[Bools, float]]
-    left_out = {"kurtosis": (unusual, np.nan), "outliers": (turns, 0)}
-    for name, (where, replacement) in left_out.items():
+    replacements: dict[str, tuple[Bools, float]]
+    replacements = {"kurtosis": (unusual, np.nan), "outliers": (turns, 0)}
+    for name, (where, replacement) in replacements.items():
         out[name].values = np.where(where, replacement, out[name].values)
     return out
 

@@ -16,7 +16,7 @@ import xarray as xr
 from gyrostab.arrays import Array, Bools
 from gyrostab.diagnose.evidence.held_out import LinearModel
 from gyrostab.diagnose.predict.candidates import Candidate, content_digest
-from gyrostab.diagnose.reduce.block_statistics import measured, pair_indices
+from gyrostab.diagnose.reduce.schema import pair_indices, read_as_measured
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.expected import correlated_powers
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
@@ -259,7 +259,7 @@ def expected_cross(baseline: xr.Dataset) -> Array | None:
 def reference_channel_power(name: str, blocks: xr.Dataset) -> Array:
     """Return the power of a channel on the log's time, or of an axis as measured, (block, band)."""
     if name in blocks["axis"].values:
-        return np.asarray(measured(blocks, "power").sel(axis=name).values)
+        return np.asarray(read_as_measured(blocks, "power").sel(axis=name).values)
     return np.asarray(blocks["reference_power"].sel(reference=name).values)
 
 

@@ -10,7 +10,10 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Floats
-from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_motion
+from gyrostab.diagnose.baseline.known_effects import (
+    find_blocks_with_known_motion,
+    remove_known_motion,
+)
 from gyrostab.diagnose.identify.selections import Selection, components_of
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.predict.candidates import Component
@@ -302,7 +305,7 @@ def _moving_spans(
 ) -> list[tuple[float, float]]:
     """Return the blocks [s] in which an effect moves the rate of an axis within the block."""
     axes = [str(axis) for axis in blocks["axis"].values]
-    moving = expect_known_motion(blocks, after, settings=settings)
+    moving = find_blocks_with_known_motion(blocks, after, settings=settings)
     is_moving = np.zeros(blocks.sizes["block"], np.bool_)
     for component in (
         component

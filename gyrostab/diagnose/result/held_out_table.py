@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Array, Bools, Floats
-from gyrostab.diagnose.baseline.calibrate import calibrate_on_known
+from gyrostab.diagnose.baseline.calibrate import calibrate_on_training_blocks
 from gyrostab.diagnose.baseline.expected_statistics import reduced_shape
 from gyrostab.diagnose.estimate.conditioned_baseline import expected_baseline, predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import Fitted
@@ -24,7 +24,7 @@ from gyrostab.diagnose.evidence.products import axis_noise, mean_products
 from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.identify.selections import Selection, components_of
 from gyrostab.diagnose.predict.candidates import Component
-from gyrostab.diagnose.reduce.block_statistics import pair_indices
+from gyrostab.diagnose.reduce.schema import pair_indices
 from gyrostab.diagnose.result.attribution import active_blocks
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
@@ -71,32 +71,34 @@ def measure_held_out(
     )
 
     settings = identifications.state.settings
-    calibrated: dict[bytes, xr.Dataset] = {}  # by the known blocks
+    calibrated: dict[bytes, xr.Dataset] = {}  # by the training blocks
 
-    def calibrate(known: Bools) -> xr.Dataset:
-        place = known.tobytes()
+    def calibrate(training: Bools) -> xr.Dataset:
+        place = training.tobytes()
         if place not in calibrated:
-            calibrated[place] = calibrate_on_known(blocks, baseline, known, settings=settings)
+            calibrated[place] = calibrate_on_training_blocks(
+                blocks, baseline, training, settings=settings
+            )
         return calibrated[place]
 
-    def before(known: Bools) -> xr.Dataset:
-        return expected_baseline(with_course, calibrate(known), known)
+    def before(training: Bools) -> xr.Dataset:
+        return expected_baseline(with_course, calibrate(training), training)
 
     def train(
-        chosen: Identifications, known: Bools, is_left_out: Sequence[bool] = ()
+        chosen: Identifications, training: Bools, is_left_out: Sequence[bool] = ()
     ) -> xr.Dataset:
-        noise = recalibrate(chosen, calibrate(known), first_fit, known)
+        noise = recalibrate(chosen, calibrate(training), first_fit, training)
         renewed = with_noise(chosen, noise)
         left_out = tuple(compress(renewed.identified, is_left_out))
-        return predict_baseline(renewed, noise, known, left_out=left_out)
+        return predict_baseline(renewed, noise, training, left_out=left_out)
 
     after = partial(train, judged) if judged.identified else before
     with_phase_locked = partial(train, with_course) if identified else before
-    known = select_forecast_start(blocks)
+    training = select_forecast_start(blocks)
     begun = tuple(
         identification
         for identification in judged.identified
-        if active_blocks(identification, blocks, settings=settings)[known].any()
+        if active_blocks(identification, blocks, settings=settings)[training].any()
     )
     # what is over later is not forecast, but is in the blocks that the noise is calibrated on
     is_over = [not _can_be_forecast(identification, blocks, settings) for identification in begun]
@@ -165,12 +167,13 @@ def _can_be_forecast(identification: Selection, blocks: xr.Dataset, settings: Se
     if all(component.statistic.is_count for component in identification.components):
         return False
     acts = active_blocks(identification, blocks, settings=settings)
-    known = select_forecast_start(blocks)
+    training = select_forecast_start(blocks)
     has_later_step = any(
-        component.is_step and (np.ptp(component.variant.design[..., known], axis=-1) == 0.0).any()
+        component.is_step
+        and (np.ptp(component.variant.design[..., training], axis=-1) == 0.0).any()
         for component in identification.components
     )
-    return bool(acts[~known].any() and not has_later_step)
+    return bool(acts[~training].any() and not has_later_step)
 
 
 def held_out(
@@ -241,9 +244,9 @@ def held_out(
         if not moves:
             break
     evidence_nats, variance = max(length_nats.tolist() for length_nats in nats_by_length)
-    known = select_forecast_start(blocks)
+    training = select_forecast_start(blocks)
     late, early = (
-        log_likelihood(blocks, model(known), known, ~known) for model in (forecast, before)
+        log_likelihood(blocks, model(training), training, ~training) for model in (forecast, before)
     )
     return {
         "blocks": windows.first.size,
@@ -286,20 +289,20 @@ def cut_stretches(blocks: xr.Dataset) -> BlockWindows:
     return BlockWindows(edge[:-1], edge[1:])
 
 
-def log_likelihood(blocks: xr.Dataset, baseline: xr.Dataset, known: Bools, held: Bools) -> float:
-    """Return the log-likelihood of held-out blocks given the known blocks [nats].
+def log_likelihood(blocks: xr.Dataset, baseline: xr.Dataset, training: Bools, held: Bools) -> float:
+    """Return the log-likelihood of held-out blocks given the training blocks [nats].
 
     It leaves out a constant that depends only on the data.
 
     Parameters
     ----------
-    known, held : ndarray of bool (block,)
+    training, held : ndarray of bool (block,)
         Blocks to predict from, and blocks to predict.
     """
     total = float((_power_terms(blocks, baseline) + _cross_terms(blocks, baseline))[held].sum())
     for axis in map(str, blocks["axis"].values):
-        total += _mean_evidence(blocks, baseline, axis, known | held) - _mean_evidence(
-            blocks, baseline, axis, known
+        total += _mean_evidence(blocks, baseline, axis, training | held) - _mean_evidence(
+            blocks, baseline, axis, training
         )
     return total
 

@@ -22,7 +22,7 @@ from gyrostab.diagnose.identify.selections import Selection, components_of
 from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
 from gyrostab.diagnose.predict.candidates import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.predict.windows import channel_units, make_windows
-from gyrostab.diagnose.reduce.block_statistics import iso, measured
+from gyrostab.diagnose.reduce.schema import format_time, read_as_measured
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from gyrostab.diagnose.result.diagnosis import effect_table
 from gyrostab.diagnose.result.families import find_families
@@ -121,7 +121,9 @@ def effect_tables(
                 "name": identification.effect,
                 "axes": list(fitted_effect.axes),
                 "driver": ",".join(filter(None, identification.driver)) or None,
-                "intervals": [[iso(blocks, low), iso(blocks, high)] for low, high in when],
+                "intervals": [
+                    [format_time(blocks, low), format_time(blocks, high)] for low, high in when
+                ],
                 "parameters": {
                     name: asdict(estimate) for name, estimate in fitted_effect.parameters.items()
                 },
@@ -264,8 +266,8 @@ def _make_mismatch(
     return {
         "view": view,
         "axes": list(axes),
-        "start": iso(blocks, span[0]),
-        "end": iso(blocks, span[1]),
+        "start": format_time(blocks, span[0]),
+        "end": format_time(blocks, span[1]),
         "tau_min_s": taus[0],
         "tau_max_s": taus[1],
         "ratio": None,
@@ -399,7 +401,7 @@ def motion_mismatches(identified: Sequence[Selection], blocks: xr.Dataset) -> li
     if "moving" not in blocks:
         return []
     begin, end = blocks["begin"].values, blocks["end"].values
-    means = measured(blocks, "mean").values
+    means = read_as_measured(blocks, "mean").values
     out: list[dict[str, Any]] = []
     for row, axis in enumerate(map(str, blocks["axis"].values)):
         moving, mean = blocks["moving"].values[row], means[row]

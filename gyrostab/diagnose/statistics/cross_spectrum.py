@@ -32,7 +32,7 @@ from gyrostab.diagnose.predict.linear_model import (
     unspread_share,
     variant_designs,
 )
-from gyrostab.diagnose.reduce.block_statistics import pair_indices
+from gyrostab.diagnose.reduce.schema import pair_indices
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.mismatch_wording import capitalise_axes, taus_text
 from gyrostab.diagnose.statistics.power import with_axis

@@ -22,7 +22,7 @@ from gyrostab.diagnose.predict.linear_model import (
     records_last,
 )
 from gyrostab.diagnose.predict.sizes import component_mixture
-from gyrostab.diagnose.reduce.block_statistics import noise_at_orders
+from gyrostab.diagnose.reduce.rotation_orders import noise_at_orders
 from gyrostab.diagnose.statistics.base import NullDraw, SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.scores import BlockWindows, exponential_score, sum_over_windows
 from gyrostab.noise import NORMAL_95

@@ -46,7 +46,7 @@ def estimate_from_counts(
     row = [str(name) for name in blocks["axis"].values].index(axis)
     usual = float(count_evidence.of[mark][0][row].sum()) if mark in count_evidence.of else 0.0
     if effect == "spikes":
-        count = max(float(on_axis["peaks"].where(on_axis[mark] > 0).sum()), 1.0)
+        count = max(float(on_axis["outlier_count"].where(on_axis[mark] > 0).sum()), 1.0)
         return _size_spikes(count, hours, _estimate_outliers(blocks, axis), settings)
     if effect == "held_samples":
         if not float(on_axis["quantization_step"]) > 0.0:
@@ -252,7 +252,7 @@ def _estimate_outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, flo
     """
     count, excess, samples = (
         axis_values(blocks, name, axis).astype(np.float64)
-        for name in ("peaks", "kurtosis", "samples")
+        for name in ("outlier_count", "kurtosis", "samples")
     )
     good = (count > 0.0) & np.isfinite(excess) & (excess > 0.0)
     single = good & (count == 1.0)  # several in a block differ in size

@@ -25,7 +25,7 @@ from gyrostab.diagnose.predict.linear_model import (
 )
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.predict.windows import distinct_variants
-from gyrostab.diagnose.reduce.block_statistics import measured
+from gyrostab.diagnose.reduce.schema import read_as_measured
 from gyrostab.diagnose.statistics.base import NullDraw, Statistic
 from gyrostab.diagnose.statistics.cross_spectrum import draw_coherency
 from gyrostab.physics.base import Effect
@@ -139,7 +139,7 @@ def reference_channel_of(
     """
     axes = [str(axis) for axis in blocks["axis"].values]
     if name in axes:
-        cross = records_last(measured(data, "cross").values, 3)
+        cross = records_last(read_as_measured(data, "cross").values, 3)
         has_power = np.isfinite(blocks["power"].values[row])[..., None]
         expected = expected_cross(baseline)
         cross = cross if expected is None else cross - expected[..., None]

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Floats, Ints
-from gyrostab.diagnose.reduce.block_statistics import pair_indices
+from gyrostab.diagnose.reduce.schema import pair_indices
 from gyrostab.diagnose.statistics.base import Region, Statistic
 from gyrostab.diagnose.statistics.mismatch_wording import axes_text, length_text, taus_text
 from gyrostab.diagnose.statistics.power import LEVEL_COLUMNS

@@ -247,11 +247,10 @@ def test_axis_without_an_effect_keeps_its_noise(shaken):
 def test_axes_that_need_larger_grids_before_than_after(shaken):
     identifications, baseline, _ = shaken
     blocks = identifications.state.blocks
-    quiet = np.ones((2, blocks.sizes["block"]), np.bool_)
-    quiet[0, 2:] = False
-    wide = assemble_baseline(
-        blocks, calibrate_axes(blocks, quiet, DEFAULTS), quiet=quiet, attrs=baseline.attrs
-    )
+    quiescent = np.ones((2, blocks.sizes["block"]), np.bool_)
+    quiescent[0, 2:] = False
+    posteriors = calibrate_axes(blocks, quiescent, DEFAULTS)
+    wide = assemble_baseline(blocks, posteriors, quiescent=quiescent, attrs=baseline.attrs)
     after = recalibrate(identifications, wide, fit_identifications(identifications, wide))
     assert after.sizes["grid"] < wide.sizes["grid"]
     for axis in "xy":
