@@ -23,7 +23,7 @@ from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 
 EFFECTS = ("temperature_bias", "shupe", "warm_up", "vibration_rectification", "bias_jump")
 COLUMNS = ("all known", "size unknown", "K and B unknown too", "scored")

@@ -15,17 +15,20 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
-from gyrostab.diagnose.baseline.known_effects import expect_known_motion, filtered_blocks
+from gyrostab.diagnose.baseline.known_effects import (
+    find_blocks_with_known_motion,
+    with_filtered_shapes,
+)
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
 from gyrostab.diagnose.estimate.conditioned_baseline import expected_baseline, without_expected
-from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.recalibrate import remove_fast_switching
-from gyrostab.diagnose.estimate.unexplained_motion import unexplained_motion
+from gyrostab.diagnose.estimate.unexplained_motion import find_unexplained_motion
 from gyrostab.diagnose.identify.examination import prepare_examination
-from gyrostab.diagnose.identify.identification import components_of
+from gyrostab.diagnose.identify.forms import choose_forms
+from gyrostab.diagnose.identify.forward_search import identify_effects
 from gyrostab.diagnose.identify.late_channels import find_late_channel
-from gyrostab.diagnose.identify.selection import identify_effects
-from gyrostab.diagnose.locate.mismatches import Region, locate_mismatches
+from gyrostab.diagnose.identify.selections import components_of
+from gyrostab.diagnose.locate.mismatches import locate_mismatches
 from gyrostab.diagnose.nulls.records import repeatable_null_records
 from gyrostab.diagnose.nulls.scores import NullScores, null_scores
 from gyrostab.diagnose.predict.linear_model import initial_state
@@ -34,7 +37,9 @@ from gyrostab.diagnose.result.attribution import drop_expected
 from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.diagnose.result.finish import finish_diagnosis
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.statistics.base import Region
 from gyrostab.diagnose.task import (
+    CALLER_LEVEL,
     NamedBlocks,
     Task,
     check_axis_names,
@@ -138,7 +143,7 @@ def diagnose(
 
 
 def _run_steps(task: Task, block: Any) -> Diagnosis:
-    """Run the seven steps in their order; each reason to compare again occurs at most once."""
+    """Run the seven steps in their order, the first four again where they find a reason to."""
     started = time.perf_counter()
     task, named = _identify_with_late_channels(task, block)
     mismatches, null = _locate_mismatches(task, named)
@@ -148,20 +153,23 @@ def _run_steps(task: Task, block: Any) -> Diagnosis:
 
 def _identify_with_late_channels(task: Task, block: Any) -> tuple[Task, NamedBlocks]:
     """Steps 1 to 4; again with a channel moved in time if that explains more, each channel once."""
-    known = task.simulation.delay if isinstance(task.simulation, Model) else {}
+    model_delays = task.simulation.delay if isinstance(task.simulation, Model) else {}
     channels = log_channels(task.log)
-    delays = {name: delay_s for name, delay_s in known.items() if name in channels}
-    reduced, named = _identify_with_delays(task, block, delays)
-    while late := find_late_channel(named.identifications, named.baseline, reduced.log, delays):
+    delays = {name: delay_s for name, delay_s in model_delays.items() if name in channels}
+    aligned_task, named = _identify_with_delays(task, block, delays)
+    while late := find_late_channel(
+        named.identifications, named.baseline, aligned_task.log, delays
+    ):
         channel, delay_s = late
-        tried = {**delays, channel: delay_s}
+        tried_delays = {**delays, channel: delay_s}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # given above
-            moved, renamed = _identify_with_delays(task, block, tried)
-        if not any(channel in effect.driver for effect in renamed.identifications.identified):
+            tried_task, named_again = _identify_with_delays(task, block, tried_delays)
+        identified = named_again.identifications.identified
+        if not any(channel in identification.driver for identification in identified):
             break
-        delays, reduced, named = tried, moved, renamed
-    return reduced, named
+        delays, aligned_task, named = tried_delays, tried_task, named_again
+    return aligned_task, named
 
 
 def _identify_with_delays(
@@ -170,7 +178,7 @@ def _identify_with_delays(
     """Steps 1 to 4, with late channels moved by their delays [s]."""
     log = move_channels(task.log, delays).assign_attrs(channel_delays=dict(delays))
     task, blocks = _reduce_recording(replace(task, log=log), block)
-    named = _identify_effects(task, *_calibrate_baseline(task, blocks))
+    named = _identify_effects(task, *_prepare_comparison(task, blocks))
     for revise in (_leave_out_motion, _leave_motion_out_of_lines, _take_out_fast_switching):
         named = revise(task, named) or named
     return task, named
@@ -180,7 +188,7 @@ def _reduce_recording(task: Task, block: Any) -> tuple[Task, xr.Dataset]:
     """Step 1: reduce the axes that vary to block statistics."""
     aligned = align_channels(task.log)
     for note in aligned.notes:
-        warnings.warn(note, stacklevel=6)
+        warnings.warn(note, stacklevel=CALLER_LEVEL)
     log = aligned.log.assign_attrs(unused_channels=aligned.unused)
     simulation = task.simulation
     blocks = task.reduce(log, block=block)
@@ -192,18 +200,18 @@ def _reduce_recording(task: Task, block: Any) -> tuple[Task, xr.Dataset]:
     return replace(task, log=log, simulation=simulation), blocks
 
 
-def _calibrate_baseline(task: Task, blocks: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+def _prepare_comparison(task: Task, blocks: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """Step 2: return the blocks in which the model does not move the rate, and the baseline."""
     task.progress("calibrating", 0)
     if not isinstance(task.simulation, Model):
         return blocks, _make_baseline(task, blocks)
-    blocks = filtered_blocks(blocks, task.simulation)
+    blocks = with_filtered_shapes(blocks, task.simulation)
     baseline = _make_baseline(task, blocks)
-    moving = expect_known_motion(blocks, baseline, settings=task.settings)
+    moving = find_blocks_with_known_motion(blocks, baseline, settings=task.settings)
     if moving.any():
         # the model has the motion
-        at_rest = task.without_motion(blocks, moving).drop_vars("moving")
-        blocks = filtered_blocks(at_rest, task.simulation)
+        blocks_at_rest = task.without_motion(blocks, moving).drop_vars("moving")
+        blocks = with_filtered_shapes(blocks_at_rest, task.simulation)
         baseline = _make_baseline(task, blocks)
     return blocks, baseline
 
@@ -222,27 +230,29 @@ def _make_baseline(task: Task, blocks: xr.Dataset) -> xr.Dataset:
 
 def _identify_effects(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> NamedBlocks:
     """Steps 3 and 4: draw null records, and identify effects with half of the false-alarm level."""
-    blocks_without_lines, records = _without_lines(task, blocks, baseline)
+    blocks_without_lines, draw_null_records = _prepare_null_records(task, blocks, baseline)
     task.progress("naming", 0)
     known_effects = task.simulation.effects if isinstance(task.simulation, Model) else ()
     examination = prepare_examination(
         blocks_without_lines,
         baseline,
-        records(),
+        draw_null_records(),
         level=task.level / 2.0,
         seed=task.seed,
-        known=[effect for effect in known_effects if effect.name in baseline.attrs["left_out"]],
+        model_effects=[
+            effect for effect in known_effects if effect.name in baseline.attrs["shown_elsewhere"]
+        ],
         progress=task.progress,
         settings=task.settings,
     )
-    identifications = settle_forms(identify_effects(examination), baseline)
-    return NamedBlocks(blocks, baseline, records, identifications)
+    identifications = choose_forms(identify_effects(examination), baseline)
+    return NamedBlocks(blocks, baseline, draw_null_records, identifications)
 
 
-def _without_lines(
+def _prepare_null_records(
     task: Task, blocks: xr.Dataset, baseline: xr.Dataset
 ) -> tuple[xr.Dataset, Callable[[], Iterable[xr.Dataset]]]:
-    """Return the blocks without the lines of the baseline, and their null records."""
+    """Return the blocks without the lines of the baseline, and what draws their null records."""
     blocks = remove_known_lines(blocks, baseline, settings=task.settings)
     return blocks, repeatable_null_records(blocks, baseline, task.nulls, task.seed)
 
@@ -253,11 +263,13 @@ def _locate_mismatches(task: Task, named: NamedBlocks) -> tuple[list[Region], Nu
     blocks, baseline = named.identifications.state.blocks, named.baseline
     identifications, expected = named.identifications, named.identifications.expected
     task.progress("comparing", 0)
-    null = null_scores(baseline, named.null_records(), settings=task.settings)
+    null = null_scores(baseline, named.draw_null_records(), settings=task.settings)
     conditioned_baseline = expected_baseline(identifications, baseline)
-    at_rest = lines_without_motion(task, blocks, conditioned_baseline) if expected else blocks
+    blocks_at_rest = (
+        lines_without_motion(task, blocks, conditioned_baseline) if expected else blocks
+    )
     mismatches = locate_mismatches(
-        without_expected(at_rest, baseline, expected, task.settings),
+        without_expected(blocks_at_rest, baseline, expected, task.settings),
         conditioned_baseline,
         null,
         level=level,
@@ -274,20 +286,21 @@ def _leave_out_motion(task: Task, named: NamedBlocks) -> NamedBlocks | None:
         return None
     blocks, identifications = named.blocks, named.identifications
     state = replace(
-        identifications.start_state(named.baseline), weight=identifications.state.weight
+        identifications.state_without_effects(named.baseline),
+        expected_power=identifications.state.expected_power,
     )
-    moving = unexplained_motion(blocks, identifications.identified, state)
+    moving = find_unexplained_motion(blocks, identifications.identified, state)
     if not moving.any():
         return None
     try:
-        calibrated = _calibrate_baseline(task, task.without_motion(blocks, moving))
+        comparison = _prepare_comparison(task, task.without_motion(blocks, moving))
     except SchemaError as error:
         warnings.warn(
             f"the diagnosis includes unexplained motion: without it too little is left ({error})",
-            stacklevel=6,
+            stacklevel=CALLER_LEVEL,
         )
         return None
-    return _identify_effects(task, *calibrated)
+    return _identify_effects(task, *comparison)
 
 
 def _leave_motion_out_of_lines(task: Task, named: NamedBlocks) -> NamedBlocks | None:
@@ -305,12 +318,12 @@ def _leave_motion_out_of_lines(task: Task, named: NamedBlocks) -> NamedBlocks | 
     if not moving.any():
         return None
     blocks, baseline = take_lines_at_rest(task, named.blocks, moving), named.baseline
-    blocks_without_lines, records = _without_lines(task, blocks, baseline)
+    blocks_without_lines, draw_null_records = _prepare_null_records(task, blocks, baseline)
     # with the threshold of the null records so far
     start = initial_state(blocks_without_lines, baseline, settings=task.settings)
     examination = replace(identifications.examination, start=start)
-    identifications = settle_forms(identify_effects(examination), baseline)
-    return NamedBlocks(blocks, baseline, records, identifications)
+    identifications = choose_forms(identify_effects(examination), baseline)
+    return NamedBlocks(blocks, baseline, draw_null_records, identifications)
 
 
 def _take_out_fast_switching(task: Task, named: NamedBlocks) -> NamedBlocks | None:

@@ -14,9 +14,9 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools
-from gyrostab.diagnose.baseline.known_effects import expect_known_motion
+from gyrostab.diagnose.baseline.known_effects import find_blocks_with_known_motion
 from gyrostab.diagnose.baseline.known_lines import remove_known_lines
-from gyrostab.diagnose.identify.examination import Identifications
+from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.moving_blocks import without_motion
 from gyrostab.diagnose.settings import Settings
@@ -32,6 +32,9 @@ from gyrostab.wording import join_words
 #: Fewest null records: one of them is expected beyond the default level of 1 %.
 MIN_NULL_RECORDS = 100
 _SPAN_EXAMPLE = "2026-03-14T08:00/2026-03-14T08:30, or 0s/30min after the start"
+#: Stack level of the caller of `gyrostab.diagnose` for a warning of a function in `core` that
+#: `_identify_with_delays` calls.
+CALLER_LEVEL = 6
 #: Largest power [deg^2/h] that rounding alone gives a constant rate; noise of any gyro has more.
 MAX_ROUNDING_POWER = 1e-20
 
@@ -148,7 +151,7 @@ def varying_axes(blocks: xr.Dataset) -> list[str]:
             "right column was read"
         )
     for reason in reasons:
-        warnings.warn(f"{reason}: left out of the diagnosis", stacklevel=7)
+        warnings.warn(f"{reason}: left out of the diagnosis", stacklevel=CALLER_LEVEL + 1)
     return varying
 
 
@@ -204,17 +207,19 @@ class NamedBlocks(NamedTuple):
 
     blocks: xr.Dataset
     baseline: xr.Dataset  # what the simulation predicts for the blocks
-    null_records: Callable[[], Iterable[xr.Dataset]]  # the same ones on each call
+    draw_null_records: Callable[[], Iterable[xr.Dataset]]  # the same ones on each call
     #: Effects that explain the blocks without the lines of the baseline.
     identifications: Identifications
 
 
-def lines_without_motion(task: Task, blocks: xr.Dataset, known: xr.Dataset) -> xr.Dataset:
+def lines_without_motion(task: Task, blocks: xr.Dataset, baseline: xr.Dataset) -> xr.Dataset:
     """Return the blocks with line spectra from those in which no known effect moves the rate."""
-    moving = expect_known_motion(blocks, known, settings=task.settings)
+    moving = find_blocks_with_known_motion(blocks, baseline, settings=task.settings)
     at_rest = take_lines_at_rest(task, blocks, moving)
     return (
-        blocks if at_rest is blocks else remove_known_lines(at_rest, known, settings=task.settings)
+        blocks
+        if at_rest is blocks
+        else remove_known_lines(at_rest, baseline, settings=task.settings)
     )
 
 

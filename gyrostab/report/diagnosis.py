@@ -25,7 +25,7 @@ from gyrostab.diagnose.result.text import (
     rejection_text,
     without_chance,
 )
-from gyrostab.diagnose.statistics.wording import axes_text, length_text
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text, length_text
 from gyrostab.errors import FormatError, SchemaError
 from gyrostab.io.datasets import to_netcdf
 from gyrostab.io.opening import open_dataset

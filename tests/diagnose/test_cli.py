@@ -337,12 +337,12 @@ def test_line_explains_only_its_own_frequency():
         Variant({}, ("amplitude",), np.empty(0)),
         ("x",),
         50.0,
-        place=116,
+        line_index=116,
     )
     blocks = xr.Dataset(coords={"line_frequency": ("line", np.arange(1, 400) * 0.25)})
     region = {
         "view": "spectrum",
-        "what": "line",
+        "quantity": "line",
         "frequency": 29.25,
         "tau_min_s": 0.017,
         "tau_max_s": 0.017,
@@ -352,14 +352,18 @@ def test_line_explains_only_its_own_frequency():
         return line.statistic.can_explain(line, region, blocks, DEFAULTS)
 
     short = {
-        "view": "davar", "what": "avar", "frequency": np.nan, "tau_min_s": 0.01, "tau_max_s": 0.02
-    }  # fmt: skip
+        "view": "davar",
+        "quantity": "avar",
+        "frequency": np.nan,
+        "tau_min_s": 0.01,
+        "tau_max_s": 0.02,
+    }
     assert can_explain(region)
     assert not can_explain(region | {"frequency": 12.5})
-    assert not can_explain(region | {"what": "ramp phase", "frequency": np.nan})
+    assert not can_explain(region | {"quantity": "ramp phase", "frequency": np.nan})
     assert can_explain(short)
     assert not can_explain(short | {"tau_min_s": 1.0, "tau_max_s": 9.0})
-    assert not can_explain(short | {"view": "mean", "what": "mean"})
+    assert not can_explain(short | {"view": "mean", "quantity": "mean"})
 
 
 def test_p_value_is_extrapolated_beyond_the_null_records():

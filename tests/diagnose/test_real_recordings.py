@@ -13,7 +13,7 @@ import gyrostab
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.sample_counts import has_coarse_grid
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from tests.support.scripts import load_script
 
 SCRIPT = load_script("pipelines/diagnose_recordings.py")

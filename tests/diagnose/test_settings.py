@@ -46,7 +46,7 @@ def test_a_setting_changes_the_decision() -> None:
     assert failed_checks(held)
     assert not failed_checks(held, settings=Settings(coverage_tolerance=0.03))
     best = np.sort(np.random.default_rng(1).exponential(size=400))
-    wide = fit_best_evidence(best, settings=Settings(tail_share=0.1)).level(0.2)
+    wide = fit_best_evidence(best, settings=Settings(tail_share=0.1)).value_at(0.2)
     assert wide == np.quantile(best, 0.8)  # no extrapolation within the sample
 
 

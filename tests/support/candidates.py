@@ -10,13 +10,14 @@ import xarray as xr
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import group_components
-from gyrostab.diagnose.identify.examination import Examination, Identifications
-from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.identify.examination import Examination
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 
 
 def select_candidate(candidates: Iterable[Candidate], effect: str, statistic: str) -> Candidate:

@@ -79,7 +79,7 @@ def surfaces(*, axes: str = "xy", seed: int = 1) -> xr.Dataset:
 
 def content() -> dict[str, Any]:
     region = {
-        "statistic": "power", "view": "davar", "what": "avar", "axes": ["x"],
+        "statistic": "power", "view": "davar", "quantity": "avar", "axes": ["x"],
         "begin": 1500.0, "end": 1800.0,
         "tau_min_s": 0.01, "tau_max_s": 3.0, "ratio": 1.8,
         "sign": 1, "p_value": 0.0004, "estimate": 1.8, "frequency": np.nan,
@@ -87,7 +87,7 @@ def content() -> dict[str, Any]:
     shift = region | {
         "statistic": "mean",
         "view": "mean",
-        "what": "mean",
+        "quantity": "mean",
         "tau_min_s": 20.0,
         "tau_max_s": 300.0,
         "ratio": 7.0,

@@ -10,8 +10,9 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.identify.examination import Identifications, prepare_examination
-from gyrostab.diagnose.identify.selection import identify_effects
+from gyrostab.diagnose.identify.examination import prepare_examination
+from gyrostab.diagnose.identify.forward_search import identify_effects
+from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.simulate import simulate

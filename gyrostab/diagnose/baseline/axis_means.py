@@ -81,12 +81,12 @@ class AxisMeans(NamedTuple):
             return self
         ends = self.noise_ranges(K, B)
         start = np.log([K[likelihood.argmax()], B[likelihood.argmax()]])
-        without = find_peaks(self._negative_likelihood, [start], ends)[0]
+        without = maximise_likelihood(self._negative_likelihood, [start], ends)[0]
         # six of it are in the difference of two means
         angle = np.log(self.step**2 * scatter / 6.0)
         starts = [np.append(slow, angle) for slow in (without.x, ends.mean(axis=1))]
         ends = np.vstack([ends, angle + np.log(_ANGLE_RANGE)])
-        with_angle = find_peaks(self._negative_likelihood, starts, ends)[0]
+        with_angle = maximise_likelihood(self._negative_likelihood, starts, ends)[0]
         added_nats = without.fun - with_angle.fun
         return self._with_angle(with_angle.x[2]) if added_nats > least_nats else self
 
@@ -103,7 +103,7 @@ class AxisMeans(NamedTuple):
         return np.array(out)
 
 
-def find_peaks(
+def maximise_likelihood(
     negative_likelihood: Callable[[Floats], Floats], starts: Iterable[Floats], ends: Floats
 ) -> list[OptimizeResult]:
     """Find the largest likelihood from several starts; the best first.

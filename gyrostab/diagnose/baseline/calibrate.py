@@ -15,6 +15,9 @@ import xarray as xr
 
 from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.baseline.expected_statistics import (
+    B_TERM,
+    K_TERM,
+    N_TERM,
     NOISE,
     common_variance,
     noise_powers,
@@ -23,7 +26,8 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     white_variance,
 )
 from gyrostab.diagnose.baseline.posterior import (
-    Fit,
+    MIN_WHITE_SHARE,
+    BandPowers,
     Posterior,
     average_blocks,
     fit_filter_response,
@@ -52,17 +56,21 @@ _SHARE_ABOVE = 1e-3
 #: Bands that the noise terms are fitted to, with any spectral shape.
 MIN_BANDS = 6
 _MIN_LOW_SHAPE = 20.0  # of the lowest bands, which define the white noise of a block mean
+_MIN_CELL_PROBABILITY = 1e-12  # of a point of the coarse grid, so that its logarithm is finite
+#: Least factor that a filter or an effect on the lowest band has on the white variance of a mean.
+#: Design choice: no mean is exact.
+MIN_MEAN_NOISE_FACTOR = 0.1
 
 
 def _mean_noise_excess(
-    power: Floats, shape: Floats, spectrum: Floats, quiet: Bools, settings: Settings
+    power: Floats, shape: Floats, spectrum: Floats, quiescent: Bools, settings: Settings
 ) -> Floats:
     """Return the excess factor of the white variance of each mean, from the lowest bands.
 
     Bands that the noise does not explain in quiescent blocks tell nothing of the noise of a mean.
     Inputs (block, band).
     """
-    ratio, total = weighted_mean(power / spectrum, np.where(quiet[:, None], shape, 0.0))
+    ratio, total = weighted_mean(power / spectrum, np.where(quiescent[:, None], shape, 0.0))
     explained = ~_is_foreign(ratio, total, settings)
     if explained.sum() >= MIN_BANDS:
         power, shape, spectrum = power[:, explained], shape[:, explained], spectrum[:, explained]
@@ -91,20 +99,23 @@ def _coarse_grids(
     slow drift of such a null record would be evidence of an effect. All axes have as many values as
     the one that needs most.
     """
-    visible = [visible_coefficients(density, span) for density in densities]
+    visible = [visible_coefficients(density, span) for density in densities]  # K, B
     values = {}
-    for column, term in enumerate("BK"):
+    for column, term in enumerate("BK"):  # as in `Posterior.slow`
         slow = [np.sqrt(posterior.slow[:, column]) for posterior in posteriors]
-        places = [
-            (float(np.median(draws)), limits[1 - column])
+        centres_and_scales = [
+            (float(np.median(draws)), limits["KB".index(term)])
             for draws, limits in zip(slow, visible, strict=True)
         ]
         excess = max(
-            np.quantile(draws, 1.0 - _SHARE_ABOVE) / grid_values(term, *place)[-1]
-            for draws, place in zip(slow, places, strict=True)
+            np.quantile(draws, 1.0 - _SHARE_ABOVE) / grid_values(term, *centre_and_scale)[-1]
+            for draws, centre_and_scale in zip(slow, centres_and_scales, strict=True)
         )
         more = round(2.0 * math.log10(max(excess, 1.0)))
-        values[term] = [grid_values(term, *place, more=more) for place in places]
+        values[term] = [
+            grid_values(term, *centre_and_scale, more=more)
+            for centre_and_scale in centres_and_scales
+        ]
     return [_weigh_grid(*axis) for axis in zip(posteriors, values["K"], values["B"], strict=True)]
 
 
@@ -114,7 +125,7 @@ def _weigh_grid(posterior: Posterior, K: Floats, B: Floats) -> tuple[Floats, Flo
     for fine, coarse in ((posterior.K, K), (posterior.B, B)):
         between = np.sqrt(coarse[1:-1] * coarse[2:])
         place.append(np.searchsorted(np.concatenate([[coarse[1] / np.sqrt(3.0)], between]), fine))
-    mass = np.full((K.size, B.size), 1e-12)
+    mass = np.full((K.size, B.size), _MIN_CELL_PROBABILITY)
     np.add.at(mass, tuple(place), posterior.weight)
     grid = [values.ravel() for values in np.meshgrid(K, B, indexing="ij")]
     return grid[0], grid[1], np.log(mass.ravel() / mass.sum())
@@ -156,49 +167,51 @@ def calibrate_noise(
     >>> bool(abs(error) < 4.0), baseline.attrs["source"]
     (True, 'calibrated')
     """
-    chosen = find_quiescent_blocks(blocks, quiet, settings=settings)
-    attrs = {"source": "calibrated", "calibrated_on": find_quiescent_spans(blocks, chosen)}
-    posteriors = calibrate_axes(blocks, chosen, settings)
-    return assemble_baseline(blocks, posteriors, quiet=chosen, attrs=attrs, settings=settings)
-
-
-def calibrate_on_known(
-    blocks: xr.Dataset, baseline: xr.Dataset, known: Bools, *, settings: Settings = DEFAULTS
-) -> xr.Dataset:
-    """Calibrate the noise again on those quiescent blocks of a baseline that are known (block,).
-
-    A baseline that is not that of `calibrate_noise` is returned as it is, and so is one of which
-    too few blocks with a spectrum are known.
-    """
-    has_spectrum = np.isfinite(blocks["power"].values).any(axis=-1)
-    chosen = baseline["quiet"].values & known & has_spectrum
-    if (
-        baseline.attrs.get("source") != "calibrated"
-        or "recalibrated" in baseline.attrs
-        or chosen.sum(axis=1).min() < settings.min_quiescent_blocks
-    ):
-        return baseline
-    posteriors = calibrate_axes(blocks, chosen, settings)
+    quiescent = find_quiescent_blocks(blocks, quiet, settings=settings)
+    attrs = {"source": "calibrated", "calibrated_on": find_quiescent_spans(blocks, quiescent)}
+    posteriors = calibrate_axes(blocks, quiescent, settings)
     return assemble_baseline(
-        blocks, posteriors, quiet=chosen, attrs=baseline.attrs, settings=settings
+        blocks, posteriors, quiescent=quiescent, attrs=attrs, settings=settings
     )
 
 
-def calibrate_axes(blocks: xr.Dataset, chosen: Bools, settings: Settings) -> list[Posterior]:
-    """Compute the noise of every axis from the chosen blocks (axis, block)."""
+def calibrate_on_training_blocks(
+    blocks: xr.Dataset, baseline: xr.Dataset, training: Bools, *, settings: Settings = DEFAULTS
+) -> xr.Dataset:
+    """Calibrate the noise again on the quiescent blocks among the training blocks (block,).
+
+    A baseline that is not that of `calibrate_noise` is returned as it is, and so is one of which
+    too few such blocks have a spectrum.
+    """
+    has_spectrum = np.isfinite(blocks["power"].values).any(axis=-1)
+    quiescent = baseline["quiet"].values & training & has_spectrum
+    if (
+        baseline.attrs.get("source") != "calibrated"
+        or "recalibrated" in baseline.attrs
+        or quiescent.sum(axis=1).min() < settings.min_quiescent_blocks
+    ):
+        return baseline
+    posteriors = calibrate_axes(blocks, quiescent, settings)
+    return assemble_baseline(
+        blocks, posteriors, quiescent=quiescent, attrs=baseline.attrs, settings=settings
+    )
+
+
+def calibrate_axes(blocks: xr.Dataset, quiescent: Bools, settings: Settings) -> list[Posterior]:
+    """Compute the noise of every axis from its quiescent blocks (axis, block)."""
     posteriors = []
-    for row, fit in enumerate(_fit_quiescent_powers(blocks, chosen, settings)):
-        explained = _keep_explained_bands(fit, settings)
+    for row, bands in enumerate(_fit_quiescent_powers(blocks, quiescent, settings)):
+        explained = _keep_explained_bands(bands, settings)
         square = with_floor(fit_squares(explained)[0], explained)
         variance = white_variance(blocks, square[None])[row]
-        levels = _level_columns(chosen[row], settings.min_quiescent_blocks)
-        posterior = noise_posterior(fit, blocks, row, variance, chosen[row], levels, settings)
-        of_means = None if explained is fit else square
-        posteriors.append(posterior._replace(of_means=of_means))
+        levels = _level_columns(quiescent[row], settings.min_quiescent_blocks)
+        posterior = noise_posterior(bands, blocks, row, variance, quiescent[row], levels, settings)
+        squares_for_means = None if explained is bands else square
+        posteriors.append(posterior._replace(squares_for_means=squares_for_means))
     return posteriors
 
 
-def _level_columns(quiet: Bools, min_blocks: int) -> Floats:
+def _level_columns(quiescent: Bools, min_blocks: int) -> Floats:
     """Return steps that give each quiescent stretch its own level, (block, step).
 
     What moves the bias between two stretches, vibration for instance, is not noise of either. A
@@ -213,56 +226,62 @@ def _level_columns(quiet: Bools, min_blocks: int) -> Floats:
     >>> _level_columns(np.array([1, 1, 0, 1, 1, 0, 0, 1], bool), 3).T
     array([[0., 0., 0., 0., 0., 0., 0., 1.]])
     """
-    starts = np.flatnonzero(quiet & ~np.append(False, quiet[:-1]))
-    block = np.arange(quiet.size)
+    starts = np.flatnonzero(quiescent & ~np.append(False, quiescent[:-1]))
+    block = np.arange(quiescent.size)
     columns: list[Floats] = []
     last = 0
     for first in starts.tolist():
-        if quiet[last:first].sum() >= min_blocks:
+        if quiescent[last:first].sum() >= min_blocks:
             columns.append((block >= first).astype(np.float64))
             last = first
-    return np.stack(columns, axis=1) if columns else np.empty((quiet.size, 0))
+    return np.stack(columns, axis=1) if columns else np.empty((quiescent.size, 0))
 
 
-def _fit_quiescent_powers(blocks: xr.Dataset, chosen: Bools, settings: Settings) -> list[Fit]:
+def _fit_quiescent_powers(
+    blocks: xr.Dataset, quiescent: Bools, settings: Settings
+) -> list[BandPowers]:
     """Return the powers of every axis as a sum of noise terms, behind a filter if it takes one.
 
     It does where some bands are foreign to the noise terms alone, and none behind the filter.
     """
-    fits = _average_quiescent(blocks, chosen, noise_powers(blocks))
+    bands_by_axis = _average_quiescent(blocks, quiescent, noise_powers(blocks))
     if (
-        not any(_has_foreign_bands(fit, settings) for fit in fits)
-        or min(fit.power.size for fit in fits) < blocks.sizes["band"]
+        not any(_has_foreign_bands(bands, settings) for bands in bands_by_axis)
+        or min(bands.power.size for bands in bands_by_axis) < blocks.sizes["band"]
     ):
-        return fits
-    response = fit_filter_response(blocks, fits, settings=settings)
+        return bands_by_axis
+    response = fit_filter_response(blocks, bands_by_axis, settings=settings)
     if response is None:
-        return fits
-    filtered = _average_quiescent(blocks, chosen, noise_powers(blocks, response))
-    return fits if any(_has_foreign_bands(fit, settings) for fit in filtered) else filtered
+        return bands_by_axis
+    filtered = _average_quiescent(blocks, quiescent, noise_powers(blocks, response))
+    return (
+        bands_by_axis
+        if any(_has_foreign_bands(bands, settings) for bands in filtered)
+        else filtered
+    )
 
 
-def _average_quiescent(blocks: xr.Dataset, chosen: Bools, columns: Floats) -> list[Fit]:
-    """Average the powers of the chosen blocks of every axis; columns (axis, block, band, term)."""
+def _average_quiescent(blocks: xr.Dataset, quiescent: Bools, columns: Floats) -> list[BandPowers]:
+    """Average the quiescent powers of every axis; columns (axis, block, band, term)."""
     power, shape = blocks["power"].values, reduced_shape(blocks)
-    fits = []
+    bands_by_axis = []
     for row, axis in enumerate(blocks["axis"].values):
-        use = chosen[row]
-        fit = average_blocks(power[row][use], shape[row][use], columns[row][use])
-        bands = np.count_nonzero(fit.power > 0.0)
-        if bands < 4:
+        use = quiescent[row]
+        bands = average_blocks(power[row][use], shape[row][use], columns[row][use])
+        band_count = np.count_nonzero(bands.power > 0.0)
+        if band_count < 4:
             raise SchemaError(
-                f"axis {axis}: the quiescent blocks hold noise in {bands} bands, too few to "
+                f"axis {axis}: the quiescent blocks hold noise in {band_count} bands, too few to "
                 "calibrate on; give other stretches with --quiet, leave the axis out (--axis), or "
                 "diagnose a part of the record with fewer gaps"
             )
-        fits.append(fit)
-    return fits
+        bands_by_axis.append(bands)
+    return bands_by_axis
 
 
-def _has_foreign_bands(fit: Fit, settings: Settings) -> bool:
+def _has_foreign_bands(bands: BandPowers, settings: Settings) -> bool:
     """Return whether the noise terms miss the larger part of the power of a band."""
-    return bool(_is_foreign(_power_ratio(fit), fit.weight, settings).any())
+    return bool(_is_foreign(_power_ratio(bands), bands.weight, settings).any())
 
 
 def _is_foreign(ratio: Floats, weight: Floats, settings: Settings) -> Bools:
@@ -276,35 +295,35 @@ def _is_foreign(ratio: Floats, weight: Floats, settings: Settings) -> Bools:
     )
 
 
-def _keep_explained_bands(fit: Fit, settings: Settings) -> Fit:
+def _keep_explained_bands(bands: BandPowers, settings: Settings) -> BandPowers:
     """Drop the bands that the noise terms do not explain, the worst first.
 
     Lines and humps would raise the noise of block means, to which they add nothing. A spectrum
     that the terms describe to a factor of two keeps all bands.
     """
-    if not _has_foreign_bands(fit, settings):
-        return fit
-    while fit.power.size > MIN_BANDS:
-        off = np.abs(_power_ratio(fit) - 1.0) * np.sqrt(fit.weight)
+    if not _has_foreign_bands(bands, settings):
+        return bands
+    while bands.power.size > MIN_BANDS:
+        off = np.abs(_power_ratio(bands) - 1.0) * np.sqrt(bands.weight)
         worst = int(off.argmax())
         if off[worst] <= settings.excess_sigma:
             break
-        fit = Fit(
-            *(np.delete(part, worst, axis=0) for part in (fit.power, fit.columns, fit.weight))
+        bands = BandPowers(
+            *(np.delete(part, worst, axis=0) for part in (bands.power, bands.columns, bands.weight))
         )
-    return fit
+    return bands
 
 
-def _power_ratio(fit: Fit) -> Floats:
+def _power_ratio(bands: BandPowers) -> Floats:
     """Return the powers divided by those of the noise terms that fit them best."""
-    return np.asarray(fit.power / (fit.columns @ fit_squares(fit)[0]))
+    return np.asarray(bands.power / (bands.columns @ fit_squares(bands)[0]))
 
 
 def assemble_baseline(
     blocks: xr.Dataset,
     posteriors: list[Posterior],
     *,
-    quiet: Bools,
+    quiescent: Bools,
     attrs: Mapping[str, Any],
     known_mean: Floats | None = None,
     spectrum: Floats | None = None,
@@ -312,8 +331,16 @@ def assemble_baseline(
 ) -> xr.Dataset:
     """Assemble the noise of all axes as the Dataset described in `calibrate_noise`.
 
+    Every baseline is made here: of calibrated noise, of a model, or of a simulated log.
+
     Parameters
     ----------
+    posteriors : list of Posterior
+        Noise of each axis.
+    quiescent : ndarray of bool, shape (axis, block)
+        Blocks that it is calibrated on.
+    attrs : mapping
+        Attributes of the baseline.
     known_mean : ndarray, shape (axis, block), optional
         Known means of effects [degree hour-1].
     spectrum : ndarray, shape (axis, block, band), optional
@@ -321,42 +348,24 @@ def assemble_baseline(
     """
     columns = noise_powers(blocks)
     square = np.stack([posterior.square for posterior in posteriors])
-    noise = sum_noise(columns, square)
-    expected = noise if spectrum is None else spectrum
-    power, shape = blocks["power"].values, blocks["shape"].values
-    floor = np.array([1e-3 * levels.min() / HOUR for levels in expected])
-    of_means, spectrum_of_means = square.copy(), expected.copy()
-    for row, posterior in enumerate(posteriors):
-        if posterior.of_means is not None:
-            of_means[row] = posterior.of_means
-            spectrum_of_means[row] *= columns[row] @ posterior.of_means / noise[row]
-    of_means[:, 1] = np.maximum(of_means[:, 1], floor)
-    white = white_variance(blocks, of_means)
-    white = white * np.maximum(expected[..., 0] / noise[..., 0], 0.1)
-    variance = white * np.stack(
-        [
-            _mean_noise_excess(*arrays, settings)
-            for arrays in zip(power, shape, spectrum_of_means, quiet, strict=True)
-        ]
+    expected = sum_noise(columns, square) if spectrum is None else spectrum
+    floor = np.array([MIN_WHITE_SHARE * levels.min() / HOUR for levels in expected])  # of N^2
+    white, excess = _variance_of_means(
+        blocks, posteriors, columns, expected, floor, quiescent, settings
     )
     span = blocks.sizes["block"] * float(blocks.attrs["block_s"])
-    densities = np.maximum([posterior.square[1] for posterior in posteriors], floor) * HOUR
+    densities = np.maximum(square[:, N_TERM], floor) * HOUR
     grid_K, grid_B, grid_weight = np.stack(_coarse_grids(posteriors, densities, span), axis=1)
     common, shape_alone = common_variance(blocks)
-    # without R; B and K are those of the block means
-    roots = [
-        np.sqrt(np.concatenate([posterior.draws[:, :2], posterior.slow], axis=1))
-        for posterior in posteriors
-    ]
-    value, error = np.mean(roots, axis=1), np.std(roots, axis=1)
-    ramp_error = _ramp_error(blocks, white, value, quiet)
+    value, error = _average_coefficients(posteriors)
+    ramp_error = _ramp_error(blocks, white, value, quiescent)
     variables = {
         "coefficient": np.pad(value, ((0, 0), (0, 1))),
         "stderr": np.column_stack([error, ramp_error]),
-        "quiet": quiet,
+        "quiet": quiescent,
         "spectrum": expected,
-        "known_mean": np.zeros(quiet.shape) if known_mean is None else known_mean,
-        "mean_variance": variance,
+        "known_mean": np.zeros(quiescent.shape) if known_mean is None else known_mean,
+        "mean_variance": white * excess,
         "angle_variance": np.array([posterior.angle for posterior in posteriors]),
         "common": common,
         "shape_alone": shape_alone,
@@ -375,28 +384,73 @@ def assemble_baseline(
         for name in ("axis", "time", "begin", "end", "frequency", "band_low", "band_high")
         if name in blocks
     }
-    of_axes = [*zip(map(str, blocks["axis"].values), posteriors, strict=True)]
+    axis_posteriors = [*zip(map(str, blocks["axis"].values), posteriors, strict=True)]
     return xr.Dataset(
         label_variables(variables, BASELINE),
         coords={**coordinates, "term": list(TERMS), "noise": list(NOISE), "slow": ["B", "K"]},
         attrs={
             **attrs,
-            "slow_noise_apart": [axis for axis, posterior in of_axes if not posterior.joined],
+            "slow_noise_apart": [
+                axis for axis, posterior in axis_posteriors if not posterior.joined
+            ],
             "white_noise_of_means_apart": [
-                axis for axis, posterior in of_axes if posterior.of_means is not None
+                axis
+                for axis, posterior in axis_posteriors
+                if posterior.squares_for_means is not None
             ],
         },
     )
 
 
-def _ramp_error(blocks: xr.Dataset, white: Floats, value: Floats, quiet: Bools) -> Floats:
+def _variance_of_means(
+    blocks: xr.Dataset,
+    posteriors: list[Posterior],
+    columns: Floats,
+    expected: Floats,
+    floor: Floats,
+    quiescent: Bools,
+    settings: Settings,
+) -> tuple[Floats, Floats]:
+    """Return the white variance of the block means, and its excess factor, (axis, block).
+
+    What effects do to the lowest band they do to the white noise of the means. `columns` are those
+    of `noise_powers`, `expected` is the power with effects (axis, block, band), and N^2 of an axis
+    is at least `floor`.
+    """
+    power, shape = blocks["power"].values, blocks["shape"].values
+    squares = np.stack([posterior.square for posterior in posteriors])
+    noise, spectrum = sum_noise(columns, squares), expected.copy()
+    for row, posterior in enumerate(posteriors):
+        if posterior.squares_for_means is not None:
+            squares[row] = posterior.squares_for_means
+            spectrum[row] *= columns[row] @ posterior.squares_for_means / noise[row]
+    squares[:, N_TERM] = np.maximum(squares[:, N_TERM], floor)
+    white = white_variance(blocks, squares)
+    white = white * np.maximum(expected[..., 0] / noise[..., 0], MIN_MEAN_NOISE_FACTOR)
+    excess = [
+        _mean_noise_excess(*arrays, settings)
+        for arrays in zip(power, shape, spectrum, quiescent, strict=True)
+    ]
+    return white, np.stack(excess)
+
+
+def _average_coefficients(posteriors: list[Posterior]) -> tuple[Floats, Floats]:
+    """Return Q, N, B, K and their standard errors, (axis, 4); B and K are those of the means."""
+    roots = [
+        np.sqrt(np.concatenate([posterior.draws[:, :2], posterior.slow], axis=1))
+        for posterior in posteriors
+    ]
+    return np.mean(roots, axis=1), np.std(roots, axis=1)
+
+
+def _ramp_error(blocks: xr.Dataset, white: Floats, value: Floats, quiescent: Bools) -> Floats:
     """Return the error of a ramp fitted to the quiescent means [deg/h^2]."""
     hours = (blocks["begin"].values + blocks["end"].values)[:, None] / (2.0 * HOUR)
-    present = quiet & np.isfinite(blocks["mean"].values)
+    present = quiescent & np.isfinite(blocks["mean"].values)
     step = float(blocks.attrs["block_s"])
     error = np.full(len(white), np.inf)
     for row, variance in enumerate(white):
-        K, B = value[row, 3:4], value[row, 2:3]
+        K, B = value[row, [K_TERM]], value[row, [B_TERM]]
         information = mean_products(
             hours[:, :0], hours, variance=variance, step=step, K=K, B=B, present=present[row]
         ).gram[0, 0, 0]

@@ -21,10 +21,10 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import OptimizeResult
 
 from gyrostab.arrays import Bools, Floats, Ints
-from gyrostab.diagnose.baseline.axis_means import AxisMeans, find_peaks
+from gyrostab.diagnose.baseline.axis_means import AxisMeans, maximise_likelihood
 from gyrostab.diagnose.baseline.expected_statistics import reduced_shape
 from gyrostab.diagnose.baseline.posterior import (
-    Fit,
+    BandPowers,
     average_groups,
     fine_grid,
     fit_squares,
@@ -32,7 +32,7 @@ from gyrostab.diagnose.baseline.posterior import (
 )
 from gyrostab.diagnose.evidence.held_out import mean_residual
 from gyrostab.diagnose.evidence.wandering import add_correlated, expected_processes
-from gyrostab.diagnose.predict.condition import fit_powers
+from gyrostab.diagnose.predict.condition import SCORING_STEPS, fit_powers
 from gyrostab.diagnose.predict.linear_model import (
     State,
     band_widths,
@@ -45,9 +45,9 @@ from gyrostab.kernels.regression.nonnegative import solve_nonnegative
 from gyrostab.units import HOUR
 
 _MIN_NOISE_SHARE = 0.05  # of the power of Q and N, that effects may leave; design choice
-_SCORING_STEPS = 4  # of Fisher scoring, as in `gyrostab.diagnose.predict.condition`
+
 _MIN_CHANGE = 1e-6  # of the expected powers, from which effects change them; above rounding errors
-_LEVEL_GROUPS = 30  # of blocks of similar power, where effects change it; limits time
+_SEARCH_GROUPS = 30  # of blocks of similar power, where effects change it; limits time
 #: Range of the ratio of the low-frequency density of the bias to that of white noise. Design
 #: choice.
 _DENSITY_RATIOS = np.array([0.1, 1e6])
@@ -79,7 +79,7 @@ class _AxisRecord:
     """Means and powers of an axis, and what they are explained by."""
 
     blocks: xr.Dataset
-    fit: Fit
+    bands: BandPowers
     noise: Floats  # (cell,): power of Q and N that fit best without slow noise
     effects: Floats  # (cell,): power of the effects in the model
     band: Ints  # (cell,)
@@ -97,7 +97,7 @@ class _AxisRecord:
         N are the likeliest ones in the powers; the means have the white noise of the calibration.
         """
         K, B, *bias = np.exp(np.clip(points, *self.ends[: points.shape[1]].T)).T
-        added = self.effects + np.square([B, K]).T @ self.fit.columns[:, 2:].T
+        added = self.effects + np.square([B, K]).T @ self.bands.columns[:, 2:].T
         means = [self.means] * len(points)
         if bias:
             variance, time = bias[0] ** 2 / bias[1], bias[1]
@@ -106,20 +106,20 @@ class _AxisRecord:
                 for process in zip(variance.tolist(), time.tolist(), strict=True)
             ]
             added = added + variance[:, None] * self._unit_powers(time)
-        of_means = [
+        mean_nats = [
             axis_means.log_likelihood(K[[i]], B[[i]])[0] for i, axis_means in enumerate(means)
         ]
         expected = self._fit_fast_noise(added)
-        of_powers = (np.log(expected) + self.fit.power / expected) @ self.fit.weight
-        return np.array([of_means, -of_powers])
+        power_nats = -((np.log(expected) + self.bands.power / expected) @ self.bands.weight)
+        return np.array([mean_nats, power_nats])
 
     def _fit_fast_noise(self, added: Floats) -> Floats:
         """Return the expected powers, those of the likeliest Q and N added (Fisher scoring)."""
-        columns, least = self.fit.columns[:, :2], _MIN_NOISE_SHARE * self.noise
+        columns, least = self.bands.columns[:, :2], _MIN_NOISE_SHARE * self.noise
         expected = np.maximum(self.noise + added, least)
-        for _ in range(_SCORING_STEPS):
-            weighted = columns.T * (self.fit.weight / expected**2)[:, None]
-            right = (weighted @ (self.fit.power - added)[..., None])[..., 0]
+        for _ in range(SCORING_STEPS):
+            weighted = columns.T * (self.bands.weight / expected**2)[:, None]
+            right = (weighted @ (self.bands.power - added)[..., None])[..., 0]
             square = solve_nonnegative(weighted @ columns, right)
             expected = np.maximum(square @ columns.T + added, least)
         return expected
@@ -130,11 +130,11 @@ class _AxisRecord:
         Their scatter about those of these parameters is their deviance per degree of freedom,
         1 for a good fit (McCullagh and Nelder 1989, Generalized Linear Models, sec. 8.3).
         """
-        of_powers = float(self.log_likelihoods(point[None])[1, 0])
-        weight, power = self.fit.weight, self.fit.power
-        deviance = 2.0 * (-float((weight * (np.log(power) + 1.0)).sum()) - of_powers)
+        power_nats = float(self.log_likelihoods(point[None])[1, 0])
+        weight, power = self.bands.weight, self.bands.power
+        deviance = 2.0 * (-float((weight * (np.log(power) + 1.0)).sum()) - power_nats)
         scatter = max(deviance / max(power.size - point.size - 2, 1), 1.0)
-        return replace(self, fit=self.fit._replace(weight=weight / scatter))
+        return replace(self, bands=self.bands._replace(weight=weight / scatter))
 
     def start_grid(self) -> Floats:
         """Return the values of each parameter from which a search may start, (parameter, value)."""
@@ -153,11 +153,11 @@ class _AxisRecord:
         """Return the most likely of several points, (parameter,)."""
         return np.asarray(points[self.negative_likelihood(points).argmin()])
 
-    def find_peaks(self, starts: Sequence[Floats]) -> list[OptimizeResult]:
+    def maximise_likelihood(self, starts: Sequence[Floats]) -> list[OptimizeResult]:
         """Find the largest likelihood from several starts; the best first."""
-        return find_peaks(self.negative_likelihood, starts, self.ends[: starts[0].size])
+        return maximise_likelihood(self.negative_likelihood, starts, self.ends[: starts[0].size])
 
-    def measure_evidence(self, peak: OptimizeResult) -> tuple[float, Floats]:
+    def integrate_likelihood(self, peak: OptimizeResult) -> tuple[float, Floats]:
         """Return the evidence by Laplace's approximation, and the covariance of the parameters."""
         count = peak.x.size
         precision = _measure_curvature(self.negative_likelihood, peak.x)
@@ -192,21 +192,23 @@ def find_correlated_bias(state: State, axis: str) -> CorrelatedBias | None:
     if record is None:
         return None
     K, B, sizes, times = record.start_grid()
-    without = record.find_peaks([record.find_best(_combine_values([k], B)) for k in K[::2]])
+    without = record.maximise_likelihood(
+        [record.find_best(_combine_values([k], B)) for k in K[::2]]
+    )
     # next to a bias, K and B are each about as large as without it, or much smaller
     smaller = np.maximum(without[0].x - math.log(_SMALLER), record.ends[:2, 0])
     noise = _combine_values(*np.column_stack([without[0].x, smaller]))
-    with_bias = record.find_peaks(
+    with_bias = record.maximise_likelihood(
         [record.find_best(_combine_values(*slow[:, None], sizes, times)) for slow in noise]
     )
     record = record.with_scatter_about(with_bias[0].x)
     without, with_bias = (
-        record.find_peaks([peak.x for peak in peaks]) for peaks in (without, with_bias)
+        record.maximise_likelihood([peak.x for peak in peaks]) for peaks in (without, with_bias)
     )
-    evidence, covariance = record.measure_evidence(with_bias[0])
+    evidence, covariance = record.integrate_likelihood(with_bias[0])
     to_rms = np.array([[1.0, -0.5], [0.0, 1.0]])
     return CorrelatedBias(
-        evidence - record.measure_evidence(without[0])[0],
+        evidence - record.integrate_likelihood(without[0])[0],
         *_rms_and_time(with_bias[0]),
         to_rms @ covariance[-2:, -2:] @ to_rms.T,
     )
@@ -224,8 +226,8 @@ def fit_rms(state: State, axis: str, time: float) -> float | None:
     record = replace(record, ends=np.vstack([record.ends[:-1], [log_time, log_time]]))
     K, B, sizes, _ = record.start_grid()
     start = record.find_best(_combine_values(K[::2], B[::2], sizes, [log_time]))
-    point = record.find_peaks([start])[0].x
-    return _rms_and_time(record.with_scatter_about(point).find_peaks([point])[0])[0]
+    point = record.maximise_likelihood([start])[0].x
+    return _rms_and_time(record.with_scatter_about(point).maximise_likelihood([point])[0])[0]
 
 
 def _rms_and_time(peak: OptimizeResult) -> tuple[float, float]:
@@ -270,7 +272,7 @@ def _find_free_bands(state: State, axis: str) -> Bools:
     """Find the bands (band,) that have power of any size in the model, such as those of lines."""
     out = np.zeros(state.blocks.sizes["band"], np.bool_)
     for column in state.power_columns(axis):
-        shown = np.broadcast_to(column != 0.0, state.weight.shape[1:]).any(axis=0)
+        shown = np.broadcast_to(column != 0.0, state.expected_power.shape[1:]).any(axis=0)
         out |= shown & (shown.sum() == 1)
     return out
 
@@ -285,29 +287,29 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
     present = np.isfinite(values[:, 0])
     if chosen.sum() < MIN_BLOCKS or present.sum() < MIN_BLOCKS:
         return None
-    bands = blocks.sizes["band"]
-    columns, known = axis_values(baseline, "columns", axis), _power_of_effects(state, axis)
+    band_count = blocks.sizes["band"]
+    columns, fixed_power = axis_values(baseline, "columns", axis), _power_of_effects(state, axis)
     cells = np.stack(
         [
             *columns.transpose(2, 0, 1),
-            np.broadcast_to(np.arange(bands, dtype=np.float64), power.shape),
+            np.broadcast_to(np.arange(band_count, dtype=np.float64), power.shape),
             np.broadcast_to(unspread_share(blocks)[row][:, None], power.shape),
-            known,
+            fixed_power,
         ],
         axis=-1,
     )
-    varies = np.ptp(known[chosen], axis=0).max() > _MIN_CHANGE * np.nanmin(power[chosen])
-    fit = average_groups(
+    varies = np.ptp(fixed_power[chosen], axis=0).max() > _MIN_CHANGE * np.nanmin(power[chosen])
+    bands = average_groups(
         power,
         shape,
         np.nan_to_num(cells),
-        state.weight[row].mean(axis=1),
+        state.expected_power[row].mean(axis=1),
         chosen,
-        _LEVEL_GROUPS if varies else 1,
+        _SEARCH_GROUPS if varies else 1,
     )
-    columns = fit.columns
-    fit = Fit(fit.power, columns[:, :4], fit.weight)
-    square = with_floor(fit_squares(fit)[0], fit)
+    columns = bands.columns
+    bands = BandPowers(bands.power, columns[:, :4], bands.weight)
+    square = with_floor(fit_squares(bands)[0], bands)
     block, variance = float(blocks.attrs["block_s"]), axis_values(baseline, "mean_variance", axis)
     means = AxisMeans(
         np.where(present[:, None], values, 0.0),
@@ -331,8 +333,8 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
     )
     return _AxisRecord(
         blocks,
-        fit,
-        fit.columns[:, :2] @ square[:2],
+        bands,
+        bands.columns[:, :2] @ square[:2],
         columns[:, 6],
         np.rint(columns[:, 4]).astype(np.int64),
         columns[:, 5],

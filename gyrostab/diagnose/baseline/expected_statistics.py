@@ -20,11 +20,16 @@ from gyrostab.noise import LAWS
 
 #: Random noise terms, in the order of the dimension `noise`.
 NOISE = ("Q", "N", "B", "K")
+#: Their places in it.
+Q_TERM, N_TERM, B_TERM, K_TERM = range(len(NOISE))
 _NORMAL = ndtri((np.arange(1001) + 0.5) / 1001)  # equally likely values
 _NORMAL /= _NORMAL.std()
 _MAX_MEANS = 200  # of blocks, or of equal groups of blocks with similar means; limits time
-_ROUNDS = 100  # of a fixed-point iteration; limits time
+_TRANSFER_ROUNDS = 100  # of a fixed-point iteration; limits time
 _MIN_SHARE = 1e-3  # of a variance that is left; a power of zero has no likelihood
+#: Largest scatter that random gaps may give all bands of a block together, over that of the
+#: steadiest band; the rest is that of the band alone. Design choice.
+_MAX_GAP_SCATTER_SHARE = 0.8
 
 
 def line_columns(blocks: xr.Dataset) -> Floats:
@@ -71,9 +76,8 @@ def common_variance(blocks: xr.Dataset) -> tuple[Floats, Floats]:
         scattered - (1.0 - float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())), 0.0
     )
     common = 2.0 * scattered / samples
-    common = np.minimum(
-        common, 0.8 / np.where(np.isfinite(shape), shape, 0.0).max(axis=2, initial=1e-9)
-    )
+    largest_shape = np.where(np.isfinite(shape), shape, 0.0).max(axis=2, initial=1e-9)
+    common = np.minimum(common, _MAX_GAP_SCATTER_SHARE / largest_shape)
     return common, np.asarray(1.0 / (1.0 / shape - common[..., None]))
 
 
@@ -104,8 +108,8 @@ def white_variance(blocks: xr.Dataset, square: Floats) -> Floats:
     # Each run of samples leaves a rounding of the angle at either end.
     runs = np.maximum(apart, 0.0) * count + 1.0
     return np.asarray(
-        LAWS["N"].seconds_factor * rate * square[:, 1:2] / count
-        + 2.0 * LAWS["Q"].seconds_factor * rate**2 * square[:, :1] * runs / count**2
+        LAWS["N"].seconds_factor * rate * square[:, [N_TERM]] / count
+        + 2.0 * LAWS["Q"].seconds_factor * rate**2 * square[:, [Q_TERM]] * runs / count**2
     )
 
 
@@ -119,7 +123,11 @@ class PassedNoise(NamedTuple):
 
 
 def undo_transfer(
-    transfer: Callable[[Floats], Any], mean: Floats, variance: float, *, known: bool = False
+    transfer: Callable[[Floats], Any],
+    mean: Floats,
+    variance: float,
+    *,
+    variance_is_before: bool = False,
 ) -> PassedNoise:
     """Find the normal noise that has these block means and this variance after an effect.
 
@@ -130,7 +138,8 @@ def undo_transfer(
     mean : ndarray, shape (block,)
         Means after the effect, NaN where a block is missing, whose share is 1.
     variance : float
-        Variance of the samples about their means, after the effect or, if `known`, before it.
+        Variance of the samples about their means, after the effect, or before it
+        if `variance_is_before`.
 
     Examples
     --------
@@ -144,13 +153,13 @@ def undo_transfer(
     after = np.array([mean[group].mean() if group.size else 0.0 for group in groups])
     weight = np.array([group.size for group in groups], np.float64) / max(order.size, 1)
     before, square = after.copy(), max(variance, 1e-300)
-    for _ in range(_ROUNDS):
+    for _ in range(_TRANSFER_ROUNDS):
         noise = np.sqrt(square) * _NORMAL
         passed = transfer(before[:, None] + noise)
         spread = passed.var(axis=1)
         gain = (passed * noise).mean(axis=1) / square
         before += after - passed.mean(axis=1)
-        if not known:
+        if not variance_is_before:
             left = float(weight @ spread) / square
             square *= np.clip(variance / max(left * square, 1e-300), 0.5, 2.0)
     share, moved = np.ones(mean.size), np.zeros(mean.size)

@@ -25,7 +25,7 @@ from gyrostab.noise import TERMS
 from gyrostab.simulate.model import Model, read_model
 from gyrostab.units import HOUR
 
-_ROUNDS = 20  # of Fisher scoring, which converges quadratically
+_FACTOR_ROUNDS = 20  # of Fisher scoring, which converges quadratically
 _MIN_FACTOR_RATIO = 0.1  # of the factor before: no round may reach zero
 
 
@@ -46,7 +46,7 @@ def baseline_from_model(
     xarray.Dataset
         As from `calibrate_noise`; the noise has the error of that factor, or none. If axes share an
         effect of the model, with ``cross(pair, block, band)``, the expected cross-spectrum.
-        ``attrs["left_out"]`` lists the effects that also show elsewhere (in distributions,
+        ``attrs["shown_elsewhere"]`` lists the effects that also show elsewhere (in distributions,
         transfers, rotation orders, random wander): that part of them is not included.
 
     Raises
@@ -70,7 +70,16 @@ def baseline_from_model(
         draws = np.tile(square, (DRAWS, 1))
         K, B = np.array([coefficients["K"]]), np.array([coefficients["B"]])
         posteriors.append(
-            Posterior(square, np.zeros(4), K, B, np.ones(1), draws, draws[:, 2:], True)
+            Posterior(
+                square=square,
+                error=np.zeros(4),
+                K=K,
+                B=B,
+                weight=np.ones(1),
+                draws=draws,
+                slow=draws[:, 2:],
+                joined=True,
+            )
         )
     chosen = np.ones((len(axes), blocks.sizes["block"]), np.bool_)
     attrs: dict[str, Any] = {"source": "model", "calibrated_on": [], "model": parsed.source}
@@ -86,12 +95,12 @@ def baseline_from_model(
         posteriors, _ = scale_to_quiescent(blocks, posteriors, spectrum - added, added, chosen)
     squares = np.stack([posterior.square for posterior in posteriors])
     effects = expect_known_effects(blocks, parsed, squares)
-    attrs["left_out"] = effects.left_out
+    attrs["shown_elsewhere"] = effects.shown_elsewhere
     ramp = np.array([parsed.coefficients(axis)["R"] for axis in axes])
     out = assemble_baseline(
         blocks,
         posteriors,
-        quiet=chosen,
+        quiescent=chosen,
         attrs=attrs,
         known_mean=effects.mean + expect_ramp(blocks, ramp),
         spectrum=effects.spectrum,
@@ -99,7 +108,7 @@ def baseline_from_model(
     )
     out["mean_variance"] *= effects.white_share
     out = out.assign(label_variables(effects.variables, BASELINE))
-    if "line_noise" in out or "peaks" in out:
+    if "line_noise" in out or "broad_peaks" in out:
         _describe_lines(out, blocks, squares)
     out["coefficient"].loc[{"term": "R"}] = ramp
     out["stderr"].loc[{"term": list(TERMS) if given_blocks is None else ["R"]}] = 0.0
@@ -127,15 +136,15 @@ def _describe_lines(baseline: xr.Dataset, blocks: xr.Dataset, square: Floats) ->
             blocks["frequency"].values,
         )
         baseline["line_shape"] = baseline["line_noise"].copy(data=density / smooth)
-    if "peaks" in baseline:
-        share = independent_line_share(density + baseline["peaks"].values, blocks)
+    if "broad_peaks" in baseline:
+        share = independent_line_share(density + baseline["broad_peaks"].values, blocks)
         if "line_noise" in baseline:  # the blocks have the share of the filter
             share = share / independent_line_share(density, blocks)
         baseline["shape_alone"] *= share[:, None]
 
 
 def scale_to_quiescent(
-    blocks: xr.Dataset, posteriors: list[Posterior], noise: Floats, added: Floats, quiet: Bools
+    blocks: xr.Dataset, posteriors: list[Posterior], noise: Floats, added: Floats, quiescent: Bools
 ) -> tuple[list[Posterior], Floats]:
     """Scale the noise of a simulation to its level in quiescent blocks of the recording; say so.
 
@@ -143,7 +152,7 @@ def scale_to_quiescent(
     ----------
     noise, added : ndarray, shape (axis, block, band)
         Expected power of the noise, and power that effects of the simulation add.
-    quiet : ndarray of bool, shape (axis, block)
+    quiescent : ndarray of bool, shape (axis, block)
         Blocks to calibrate on.
 
     Returns
@@ -160,7 +169,7 @@ def scale_to_quiescent(
     """
     factors, scaled, sizes = [], [], []
     for row, (axis, posterior) in enumerate(zip(blocks["axis"].values, posteriors, strict=True)):
-        fitted = fit_noise_factor(blocks.isel(axis=[row]), noise[row], added[row], quiet[row])
+        fitted = fit_noise_factor(blocks.isel(axis=[row]), noise[row], added[row], quiescent[row])
         if fitted is None:
             raise SchemaError(
                 f"axis {axis}: the quiescent blocks hold no spectrum to calibrate the simulation "
@@ -209,7 +218,7 @@ def _fit_factor(power: Floats, noise: Floats, added: Floats, weight: Floats) -> 
     """Fit ``factor * noise + added`` to gamma-distributed powers; return also the error share."""
     factor = float((weight * power / (noise + added)).sum() / weight.sum())
     information = 0.0
-    for _ in range(_ROUNDS):
+    for _ in range(_FACTOR_ROUNDS):
         expected = factor * noise + added
         information = float((weight * (noise / expected) ** 2).sum())
         change = float((weight * noise * (power - expected) / expected**2).sum()) / information

@@ -26,8 +26,7 @@ from gyrostab.diagnose.predict.linear_model import (
     unspread_share,
     unspread_share_of_lines,
 )
-from gyrostab.diagnose.reduce.block_statistics import pair_indices
-from gyrostab.diagnose.reduce.schema import BASELINE, label_variables, weighted_mean
+from gyrostab.diagnose.reduce.schema import BASELINE, label_variables, pair_indices, weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import local_level
 from gyrostab.kernels.spectra.periodogram import band_edges
@@ -81,7 +80,7 @@ def baseline_from_simulation(
     baseline = assemble_baseline(
         blocks,
         posteriors,
-        quiet=chosen,
+        quiescent=chosen,
         attrs={"source": "simulation", "calibrated_on": spans},
         spectrum=spectrum,
         settings=settings,
@@ -205,6 +204,6 @@ def _line_statistics(
     return {
         "lines": lines,
         "lines_most": largest,
-        "peaks": peaks,
+        "broad_peaks": peaks,
         "line_spectrum": in_bands * unspread_share(blocks).mean(axis=1)[:, None],
     }

@@ -11,12 +11,14 @@ import xarray as xr
 
 from gyrostab.arrays import Array, Bools, Complexes, Floats
 from gyrostab.diagnose.baseline.expected_statistics import (
+    N_TERM,
     NOISE,
     band_columns,
     line_columns,
     undo_transfer,
 )
 from gyrostab.diagnose.baseline.known_lines import (
+    LinePower,
     expect_lines,
     independent_line_share,
     line_factors,
@@ -31,7 +33,7 @@ from gyrostab.diagnose.predict.linear_model import (
     with_correlated_powers,
 )
 from gyrostab.diagnose.predict.windows import complex_factors, predict_effect
-from gyrostab.diagnose.reduce.block_statistics import pair_indices
+from gyrostab.diagnose.reduce.schema import pair_indices
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction
@@ -39,7 +41,8 @@ from gyrostab.physics.sampling import LoggerFilter
 from gyrostab.simulate.model import Model
 from gyrostab.units import HOUR
 
-EVERYWHERE = "lattice"  # the mark of every sample: calibrated noise includes what it does
+#: Mark of a quantization grid, which every sample has: calibrated noise includes what it does.
+GRID_MARK = "lattice"
 
 
 class KnownEffects(NamedTuple):
@@ -53,7 +56,7 @@ class KnownEffects(NamedTuple):
     #: Further variables of `gyrostab.diagnose.reduce.schema.BASELINE`, if there are any: the
     #: cross-spectrum, lines at full resolution, and random processes in the means.
     variables: dict[str, Array]
-    left_out: list[str]  # effects that also show elsewhere
+    shown_elsewhere: list[str]  # effects that also show elsewhere
 
 
 def expect_known_effects(blocks: xr.Dataset, model: Model, square: Floats) -> KnownEffects:
@@ -67,22 +70,22 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Floats) -> Kn
     axes = [str(axis) for axis in blocks["axis"].values]
     shape = (len(axes), blocks.sizes["block"], blocks.sizes["band"])
     mean = np.zeros(shape[:2])
-    left = np.ones(shape[:2])  # share of the noise
+    noise_left = np.ones(shape[:2])  # share of the noise
     squares = np.repeat(square[:, None], shape[1], axis=1)
     # factors of filters on the noise terms, (axis, band, term)
     added, response = np.zeros(shape), np.ones((shape[0], shape[2], len(NOISE)))
-    narrow: list[tuple[Effect, list[int], Floats]] = []
-    coherent: list[tuple[Complexes, Floats]] = []
-    wandering: list[tuple[Prediction, list[int], Callable[[str], Floats]]] = []
-    left_out = []
+    line_powers: list[LinePower] = []
+    shared_powers: list[tuple[Complexes, Floats]] = []  # factor of each axis, and the density
+    processes_on_rows: list[ProcessesOnRows] = []
+    shown_elsewhere = []
     for effect, rows in _effects_on_rows(model, axes):
-        of_effect = tuple(axes[row] for row in rows)
-        sizes = partial(effect.expand_to_axes, axes=of_effect)
-        prediction = with_correlated_powers(predict_effect(effect, blocks, of_effect), blocks)
-        has_anomalous_samples = bool({*prediction.marks} - {EVERYWHERE})
+        axis_names = tuple(axes[row] for row in rows)
+        sizes = partial(effect.expand_to_axes, axes=axis_names)
+        prediction = with_correlated_powers(predict_effect(effect, blocks, axis_names), blocks)
+        has_anomalous_samples = bool({*prediction.marks} - {GRID_MARK})
         if has_anomalous_samples or _shows_elsewhere(prediction):
-            left_out.append(effect.name)
-        left[rows] *= _share_left(effect, model, rows, blocks)
+            shown_elsewhere.append(effect.name)
+        noise_left[rows] *= _share_left(effect, model, rows, blocks)
         if has_anomalous_samples or _switches_slowly(prediction, blocks):
             continue  # such blocks are found and left out
         for name, values in prediction.mean.items():
@@ -96,21 +99,21 @@ def expect_known_effects(blocks: xr.Dataset, model: Model, square: Floats) -> Kn
             power = np.abs(factor[:, None, None]) ** 2 * density
             added += power
             if prediction.coherent:
-                coherent.append((factor, density))
+                shared_powers.append((factor, density))
             if prediction.line is not None and factor.any():
-                narrow.append((effect, rows, power))
-        wandering.append((prediction, rows, sizes))
-    white_response = response[:, None, :, NOISE.index("N")]
+                line_powers.append(LinePower(effect, rows, power))
+        processes_on_rows.append(ProcessesOnRows(prediction, rows, sizes))
+    white_response = response[:, None, :, N_TERM]
     noise = np.einsum("fn,afn,abn->abf", band_columns(blocks), response, np.maximum(squares, 0.0))
-    spectrum = spread_by_gaps((noise + added * white_response) * left[..., None], blocks)
-    variables = _shared_cross(coherent, white_response, blocks)
+    spectrum = spread_by_gaps((noise + added * white_response) * noise_left[..., None], blocks)
+    variables = _shared_cross(shared_powers, white_response, blocks)
     if (response != 1.0).any():
         variables["line_noise"] = _filtered_lines(model, square, blocks)
-    if narrow:
-        variables |= expect_lines(blocks, narrow, white_response[:, 0])
-    processes, power = random_means(wandering, shape)
+    if line_powers:
+        variables |= expect_lines(blocks, line_powers, white_response[:, 0])
+    processes, power = random_means(processes_on_rows, shape)
     white_share = 1.0 - power / np.maximum(spectrum[..., 0], np.finfo(float).tiny)
-    return KnownEffects(mean, spectrum, white_share, variables | processes, left_out)
+    return KnownEffects(mean, spectrum, white_share, variables | processes, shown_elsewhere)
 
 
 def _effects_on_rows(model: Model, axes: list[str]) -> Iterator[tuple[Effect, list[int]]]:
@@ -135,7 +138,7 @@ def _filtered_lines(model: Model, square: Floats, blocks: xr.Dataset) -> Floats:
     return np.asarray(np.einsum("lt,alt,at->al", columns, factor, square))
 
 
-def filtered_blocks(blocks: xr.Dataset, model: Model) -> xr.Dataset:
+def with_filtered_shapes(blocks: xr.Dataset, model: Model) -> xr.Dataset:
     """Return blocks with the degrees of freedom that powers have behind the filters of a model.
 
     Where some lines of a band dominate, its power has those of fewer lines.
@@ -161,7 +164,7 @@ def _share_left(effect: Effect, model: Model, rows: list[int], blocks: xr.Datase
     for place, row in enumerate(rows):
         variance = model.coefficients(str(blocks["axis"].values[row]))["N"] ** 2 * HOUR * rate
         mean = blocks["mean"].values[row]
-        share[place] = undo_transfer(effect.transfer, mean, variance, known=True).share
+        share[place] = undo_transfer(effect.transfer, mean, variance, variance_is_before=True).share
     return share
 
 
@@ -183,18 +186,24 @@ def _added_powers(
         yield factor, density
 
 
+class ProcessesOnRows(NamedTuple):
+    """An effect whose random processes may move the block means."""
+
+    prediction: Prediction
+    rows: list[int]  # of the axes
+    sizes: Callable[[str], Floats]  # parameter -> its size on each of these rows
+
+
 def random_means(
-    wandering: Sequence[tuple[Prediction, list[int], Callable[[str], Floats]]],
-    shape: tuple[int, ...],
+    processes_on_rows: Sequence[ProcessesOnRows], shape: tuple[int, ...]
 ) -> tuple[dict[str, Array], Floats]:
     """Return the steady processes of effects as variables, and their power in the lowest band.
 
-    Whatever they add there is not white noise of the means. Each effect comes with its rows, and
-    its sizes on them.
+    Whatever they add there is not white noise of the means.
     """
     processes: list[tuple[Floats, float]] = []  # variance on each axis, correlation time
     walk, power = np.zeros((2, *shape[:2]))  # variance rate of random walks, and power of all
-    for prediction, rows, sizes in wandering:
+    for prediction, rows, sizes in processes_on_rows:
         for name, (time, variance) in prediction.wander.items():
             if prediction.levels or not _is_steady(time, variance):
                 continue
@@ -240,7 +249,7 @@ def _is_steady(time: float, variance: Floats) -> bool:
 
 
 def _shared_cross(
-    coherent: Sequence[tuple[Complexes, Floats]], response: Floats, blocks: xr.Dataset
+    shared_powers: Sequence[tuple[Complexes, Floats]], response: Floats, blocks: xr.Dataset
 ) -> dict[str, Array]:
     """Return the cross-spectrum of coherent effects after a filter (axis, 1, band), if any.
 
@@ -248,14 +257,14 @@ def _shared_cross(
     """
     first, second = pair_indices(blocks)
     shared = np.zeros(blocks["cross"].shape, np.complex128)
-    for factor, density in coherent:
+    for factor, density in shared_powers:
         product = factor[first] * np.conj(factor[second])
         shared += product[:, None, None] * np.sqrt(density[first] * density[second])
     shared *= np.sqrt(response[first] * response[second])
     return {"cross": spread_by_gaps(shared, blocks, "pair")} if shared.any() else {}
 
 
-def expect_known_motion(
+def find_blocks_with_known_motion(
     blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
 ) -> Bools:
     """Find the blocks in which a known mean moves far above its noise, (axis, block).
@@ -272,7 +281,7 @@ def remove_known_motion(
     blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
 ) -> xr.Dataset:
     """Drop powers, kurtosis and cross-spectra of blocks in which a known mean moves."""
-    moving = expect_known_motion(blocks, baseline, settings=settings)
+    moving = find_blocks_with_known_motion(blocks, baseline, settings=settings)
     if not moving.any():
         return blocks
     still = xr.DataArray(~moving, dims=("axis", "block"))

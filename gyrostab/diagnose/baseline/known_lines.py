@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -23,19 +24,24 @@ from gyrostab.kernels.spectra.periodogram import ordinates, taper
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.base import Effect
 
-_LEAK_LINES = 100  # on either side, that a line leaks into; limits time
+_LEAKAGE_REACH_LINES = 100  # on either side, that a line leaks into; limits time
 _PLACES_BETWEEN = 4  # positions of a line on either side of a frequency of the spectrum
 _FINER = 2 * _PLACES_BETWEEN  # frequencies for each line
 _PEAK_POINTS = 1000  # within a step of a density
 
 
-def expect_lines(
-    blocks: xr.Dataset, narrow: Sequence[tuple[Effect, list[int], Floats]], response: Floats
-) -> dict[str, Floats]:
-    """Return lines of effects after a filter (axis, band), as variables of a baseline.
+class LinePower(NamedTuple):
+    """An effect that makes lines."""
 
-    The effects come with their axes and their power in the bands.
-    """
+    effect: Effect
+    rows: list[int]  # of the axes
+    power: Floats  # (axis, block, band)
+
+
+def expect_lines(
+    blocks: xr.Dataset, line_powers: Sequence[LinePower], response: Floats
+) -> dict[str, Floats]:
+    """Return lines of effects after a filter (axis, band), as variables of a baseline."""
     axes = [str(axis) for axis in blocks["axis"].values]
     frequency, bands = blocks["line_frequency"].values, blocks["frequency"].values
     passed = np.stack(
@@ -45,7 +51,7 @@ def expect_lines(
     unspread, band_power = unspread_share(blocks)[..., None], np.zeros((len(axes), bands.size))
     block_size = int(blocks.attrs["block_samples"])
     leak, mean_leak, largest_leak = _line_leakage(block_size)
-    for effect, rows, density in narrow:
+    for effect, rows, density in line_powers:
         chosen = tuple(axes[row] for row in rows)
         prediction = predict_effect(effect, blocks, chosen, frequency)
         band_power += (unspread * density).mean(axis=1) * response
@@ -67,7 +73,12 @@ def expect_lines(
             for row, power in zip(rows, size * passed[rows], strict=True):
                 (steady if is_line else broad)[row] += np.convolve(power, own_leak, "same")
                 largest[row] += np.convolve(power, largest_leak, "same") if is_line else 0.0
-    return {"lines": steady, "lines_most": largest, "peaks": broad, "line_spectrum": band_power}
+    return {
+        "lines": steady,
+        "lines_most": largest,
+        "broad_peaks": broad,
+        "line_spectrum": band_power,
+    }
 
 
 def resonance_density(
@@ -122,7 +133,7 @@ def _average_over_taper(density: Floats, size: int) -> Floats:
     The density is at the frequencies of `_between_lines`.
     """
     window = np.abs(np.fft.fft(taper(size), size * _FINER)) ** 2
-    reach = min(_LEAK_LINES * _FINER, density.size // 2)
+    reach = min(_LEAKAGE_REACH_LINES * _FINER, density.size // 2)
     window = np.concatenate([window[-reach:], window[: reach + 1]])
     around = np.concatenate([density[::-1], density[:1], density, density[::-1]])
     tapered = np.convolve(around, window / window.sum(), "same")
@@ -149,7 +160,7 @@ def _line_leakage(size: int, apart: float = 0.0) -> tuple[Floats, Floats, Floats
     The offset `apart` from the middle line is in lines.
     """
     weights = taper(size)
-    reach = min(_LEAK_LINES, (ordinates(size) - 1) // 2)
+    reach = min(_LEAKAGE_REACH_LINES, (ordinates(size) - 1) // 2)
     turned = weights * np.exp(2j * np.pi * apart * np.arange(size) / size)
     padded = np.abs(np.fft.fft(turned, size * _FINER)) ** 2 / (size * (weights**2).sum())
     place = np.arange(-reach, reach + 1) * _FINER
@@ -190,8 +201,8 @@ def remove_known_lines(
         4.0 * step * _take_leakage(lines).sum(axis=-1) for lines in without_gaps
     )
     exceeds = square - largest_square > error * largest_square + settings.clear_sigma * stderr
-    peaks = _take_leakage(baseline["peaks"].values).sum(axis=-1)
-    in_peak = peaks > error * noise[:, 0]
+    broad = _take_leakage(baseline["broad_peaks"].values).sum(axis=-1)
+    in_peak = broad > error * noise[:, 0]
     new = (exceeds | (largest_square == 0.0)) & ~in_peak
     return blocks.assign(
         line_power=power.copy(data=np.where(np.isfinite(power.values), freed, np.nan)),

@@ -11,6 +11,7 @@ from scipy.special import ndtr, ndtri
 
 from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.baseline.axis_means import AxisMeans
+from gyrostab.diagnose.baseline.expected_statistics import B_TERM, K_TERM, N_TERM
 from gyrostab.diagnose.evidence.wandering import RandomProcesses, no_processes
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.windows import make_windows
@@ -21,26 +22,28 @@ from gyrostab.units import HOUR
 
 #: Number of draws from the posterior of the noise of an axis; limits memory.
 DRAWS = 512
-_MIN_POWER_RATIO = 0.05  # of expected powers that fitted effects may leave; design choice
+#: Smallest N^2 that is resolved, over that which alone gives the smallest power of a band.
+MIN_WHITE_SHARE = 1e-3
+_MIN_DRAWN_SHARE = 0.01  # of the fitted N^2, in a draw: white noise is never absent; design choice
+_MIN_POWER_WITH_EFFECTS = 0.05  # of expected powers that fitted effects may leave; design choice
 _MIN_STEP = 1e-3  # shortest step towards the best fit
 _ROUNDING_SHARE = 1e-12  # rounding error of a log likelihood
 
 
-class Fit(NamedTuple):
-    """Band powers as a sum of noise terms and effects."""
+class BandPowers(NamedTuple):
+    """Band powers, and what they are explained by: noise terms and effects."""
 
-    #: (cell,): powers, averaged over blocks, and the shapes of their gamma distributions.
-    power: Floats
+    power: Floats  # (cell,): averaged over blocks
     columns: Floats  # (cell, 4): power of the noise terms per squared coefficient
-    weight: Floats
-    known: Floats | None = None  # (cell,): known power of effects
+    weight: Floats  # (cell,): shapes of the gamma distributions of the powers
+    fixed_power: Floats | None = None  # (cell,): power of effects of fixed size
     free_columns: Floats | None = None  # (cell, column): power of effects per unit of free sizes
     precision: Floats | None = None  # (column,): precisions of normal priors of these sizes about 0
     start: Floats | None = None  # (cell,): expected powers to start from; white noise by default
 
     def rest(self) -> Floats:
-        """Return the powers minus the known ones."""
-        return self.power if self.known is None else self.power - self.known
+        """Return the powers without those of effects of fixed size."""
+        return self.power if self.fixed_power is None else self.power - self.fixed_power
 
     def free(self) -> tuple[Floats, Floats]:
         """Return columns and precisions of the free sizes."""
@@ -65,11 +68,11 @@ class Posterior(NamedTuple):
     slow: Floats
     joined: bool  # whether band powers and means agree about B and K
     #: (4,): squares that fit the bands best which the noise terms explain; None if these are all.
-    of_means: Floats | None = None
+    squares_for_means: Floats | None = None
     angle: float = 0.0  # variance of the angle where blocks meet [arcsec2]
 
 
-def average_blocks(power: Floats, shape: Floats, columns: Floats) -> Fit:
+def average_blocks(power: Floats, shape: Floats, columns: Floats) -> BandPowers:
     """Average over blocks; power and shape (block, band), columns (block, band, term)."""
     use = np.where(np.isfinite(power) & np.isfinite(shape), shape, 0.0)
     total = use.sum(axis=0)
@@ -77,20 +80,20 @@ def average_blocks(power: Floats, shape: Floats, columns: Floats) -> Fit:
     safe = np.where(has_data, total, 1.0)
     mean = (use * np.nan_to_num(power)).sum(axis=0) / safe
     mean_columns = np.einsum("ij,ijk->jk", use, columns) / safe[:, None]
-    return Fit(mean[has_data], mean_columns[has_data], total[has_data])
+    return BandPowers(mean[has_data], mean_columns[has_data], total[has_data])
 
 
 def average_groups(
     power: Floats, shape: Floats, columns: Floats, level: Floats, chosen: Bools, count: int
-) -> Fit:
+) -> BandPowers:
     """Average the chosen blocks in at most so many groups of similar level (block,)."""
     order = np.argsort(np.where(chosen, level, np.inf), kind="stable")[: int(chosen.sum())]
     groups = np.array_split(order, min(count, order.size))
-    fits = [average_blocks(power[group], shape[group], columns[group])[:3] for group in groups]
-    return Fit(*map(np.concatenate, zip(*fits, strict=True)))
+    averages = [average_blocks(power[group], shape[group], columns[group])[:3] for group in groups]
+    return BandPowers(*map(np.concatenate, zip(*averages, strict=True)))
 
 
-def fit_squares(fit: Fit) -> tuple[Floats, Floats, Floats]:
+def fit_squares(bands: BandPowers) -> tuple[Floats, Floats, Floats]:
     """Fit non-negative squares by gamma likelihood (Whittle).
 
     Returned with them are their Fisher information with the effects free, and the expected powers.
@@ -99,33 +102,34 @@ def fit_squares(fit: Fit) -> tuple[Floats, Floats, Floats]:
     --------
     >>> f = np.arange(1.0, 9.0)
     >>> columns = np.stack([f**2, np.ones(8), 1.0 / f, f**-2], axis=1)
-    >>> fit = Fit(columns @ [0.1, 2.0, 0.0, 3.0], columns, np.full(8, 100.0))
-    >>> fit_squares(fit)[0].round(6)
+    >>> bands = BandPowers(columns @ [0.1, 2.0, 0.0, 3.0], columns, np.full(8, 100.0))
+    >>> fit_squares(bands)[0].round(6)
     array([0.1, 2. , 0. , 3. ])
     """
-    width = fit.columns.shape[1]
+    width = bands.columns.shape[1]
     square, normal = np.zeros(width), np.zeros((width, width))
-    square[1] = max(
-        float((fit.weight * fit.rest() / fit.columns[:, 1]).sum() / fit.weight.sum()), 0.0
-    )
-    spectrum = fit.columns @ square if fit.start is None else fit.start
-    free_columns, precision = fit.free()
+    weighted_squares = bands.weight * bands.rest() / bands.columns[:, N_TERM]
+    square[N_TERM] = max(float(weighted_squares.sum() / bands.weight.sum()), 0.0)
+    spectrum = bands.columns @ square if bands.start is None else bands.start
+    free_columns, precision = bands.free()
     # Otherwise the likelihood is not that of these powers alone.
-    has_powers_only = not free_columns.shape[1] and fit.known is None and fit.start is None
+    has_powers_only = (
+        not free_columns.shape[1] and bands.fixed_power is None and bands.start is None
+    )
     for _ in range(50):
-        weight = fit.weight / spectrum**2
+        weight = bands.weight / spectrum**2
         normal, right, to_noise, to_right = _eliminate_free_sizes(
-            free_columns, precision, fit.columns, fit.rest(), weight
+            free_columns, precision, bands.columns, bands.rest(), weight
         )
         solution = solve_nonnegative(normal, right)
-        next_spectrum = fit.columns @ solution
-        if free_columns.shape[1] or fit.known is not None:
-            of_effects = free_columns @ (to_right - to_noise @ solution)
-            next_spectrum = next_spectrum + (fit.power - fit.rest()) + of_effects
-            next_spectrum = np.maximum(next_spectrum, _MIN_POWER_RATIO * spectrum)
+        next_spectrum = bands.columns @ solution
+        if free_columns.shape[1] or bands.fixed_power is not None:
+            power_of_effects = free_columns @ (to_right - to_noise @ solution)
+            next_spectrum = next_spectrum + (bands.power - bands.rest()) + power_of_effects
+            next_spectrum = np.maximum(next_spectrum, _MIN_POWER_WITH_EFFECTS * spectrum)
         if not (next_spectrum > 0.0).all():
             break
-        fraction = _choose_step(fit, spectrum, next_spectrum) if has_powers_only else 1.0
+        fraction = _choose_step(bands, spectrum, next_spectrum) if has_powers_only else 1.0
         square = square + fraction * (solution - square)
         next_spectrum = spectrum + fraction * (next_spectrum - spectrum)
         change = np.abs(next_spectrum / spectrum - 1.0).max()
@@ -135,20 +139,20 @@ def fit_squares(fit: Fit) -> tuple[Floats, Floats, Floats]:
     return square, normal, spectrum
 
 
-def _choose_step(fit: Fit, spectrum: Floats, next_spectrum: Floats) -> float:
+def _choose_step(bands: BandPowers, spectrum: Floats, next_spectrum: Floats) -> float:
     """Return the step towards the next spectrum, halved until the likelihood does not fall."""
-    log_likelihood = _log_likelihood(fit, spectrum)
+    log_likelihood = _log_likelihood(bands, spectrum)
     fraction = 1.0
     while fraction > _MIN_STEP and _log_likelihood(
-        fit, spectrum + fraction * (next_spectrum - spectrum)
+        bands, spectrum + fraction * (next_spectrum - spectrum)
     ) < log_likelihood - _ROUNDING_SHARE * abs(log_likelihood):
         fraction *= 0.5
     return fraction
 
 
-def _log_likelihood(fit: Fit, spectrum: Floats) -> float:
+def _log_likelihood(bands: BandPowers, spectrum: Floats) -> float:
     """Return the gamma log likelihood of a spectrum."""
-    return -float((fit.weight * (np.log(spectrum) + fit.power / spectrum)).sum())
+    return -float((bands.weight * (np.log(spectrum) + bands.power / spectrum)).sum())
 
 
 def _eliminate_free_sizes(
@@ -169,7 +173,7 @@ def _eliminate_free_sizes(
 
 
 def fit_filter_response(
-    blocks: xr.Dataset, fits: Sequence[Fit], *, settings: Settings = DEFAULTS
+    blocks: xr.Dataset, bands_by_axis: Sequence[BandPowers], *, settings: Settings = DEFAULTS
 ) -> Floats | None:
     """Return the response (band, term) of the filter that describes the powers of all axes best.
 
@@ -183,19 +187,22 @@ def fit_filter_response(
         band_response(LoggerFilter.example(**values), blocks)
         for values in LoggerFilter.example().points(make_windows(blocks, {}))
     ]
-    behind = [[fit_behind(fit, fit.columns * response) for fit in fits] for response in responses]
+    behind = [
+        [fit_behind(bands, bands.columns * response) for bands in bands_by_axis]
+        for response in responses
+    ]
     chosen = choose_filter(behind, settings)
     is_better = [
-        nats > fit_behind(fit, fit.columns)[0] + settings.ambiguous_nats
-        for fit, (nats, _) in zip(fits, behind[chosen], strict=True)
+        nats > fit_behind(bands, bands.columns)[0] + settings.ambiguous_nats
+        for bands, (nats, _) in zip(bands_by_axis, behind[chosen], strict=True)
     ]
     return responses[chosen] if all(is_better) else None
 
 
-def fit_behind(fit: Fit, columns: Floats) -> tuple[float, float]:
+def fit_behind(bands: BandPowers, columns: Floats) -> tuple[float, float]:
     """Return the largest log likelihood of powers over noise of these columns, and its Q^2."""
-    square, _, expected = fit_squares(fit._replace(columns=columns))
-    return _log_likelihood(fit, expected), float(square[0])
+    square, _, expected = fit_squares(bands._replace(columns=columns))
+    return _log_likelihood(bands, expected), float(square[0])
 
 
 def choose_filter(behind: Sequence[Sequence[tuple[float, float]]], settings: Settings) -> int:
@@ -209,21 +216,26 @@ def choose_filter(behind: Sequence[Sequence[tuple[float, float]]], settings: Set
     return int(np.where(is_close, quantization, np.inf).argmin())
 
 
-def with_floor(square: Floats, fit: Fit) -> Floats:
+def with_floor(square: Floats, bands: BandPowers) -> Floats:
     """Return squares with the smallest resolved N^2: white noise hides in the smallest power."""
-    least = 1e-3 * max(float(np.min(fit.power)), np.finfo(float).tiny) / HOUR
+    least = MIN_WHITE_SHARE * max(float(np.min(bands.power)), np.finfo(float).tiny) / HOUR
     return np.maximum(square, [0.0, least, 0.0, 0.0])
 
 
 def visible_coefficients(density: float, span: float) -> tuple[float, float]:
-    """Return K and B that the means just show in white noise of a density [degree2 hour-2 Hz-1]."""
+    """Return K and B that the means just show in white noise of a density [degree2 hour-2 Hz-1].
+
+    Their Allan variances, K^2 tau / 3 and 0.44 B^2, are equal to that of the white noise over the
+    whole span.
+    """
     return float(np.sqrt(HOUR * 3.0 * density) / span), float(np.sqrt(density / span / 0.44))
 
 
 def fine_grid(density: float, span: float, step: float) -> tuple[Floats, Floats]:
     """Return values of K and B, from invisible in the means to far above white noise."""
     K, B = visible_coefficients(density, span)
-    top = 300.0 * span / step
+    top = 300.0 * span / step  # last over first K; the last B is 30 times the root of it
+    # six values of K in a decade, and four of B; design choice
     return (
         np.geomspace(0.1 * K, 0.1 * K * top, round(6.0 * np.log10(top))),
         np.geomspace(0.1 * B, 3.0 * B * np.sqrt(top), round(4.0 * np.log10(30.0 * np.sqrt(top)))),
@@ -231,28 +243,28 @@ def fine_grid(density: float, span: float, step: float) -> tuple[Floats, Floats]
 
 
 def _likelihood_of_powers(
-    fit: Fit, spectrum: Floats, K: Floats, B: Floats
+    bands: BandPowers, spectrum: Floats, K: Floats, B: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Compute the log likelihood of the powers for every K and B.
 
     The best Q and N are returned too, unbounded (point, 2), and their information.
     """
-    free_columns, precision = fit.free()
-    weight = fit.weight / spectrum**2
-    fast_columns = np.concatenate([fit.columns[:, :2], free_columns], axis=1)
+    free_columns, precision = bands.free()
+    weight = bands.weight / spectrum**2
+    fast_columns = np.concatenate([bands.columns[:, :2], free_columns], axis=1)
     normal = _normal_matrix(fast_columns, weight, precision)
     without_q = _normal_matrix(fast_columns[:, 1:], weight, precision)
-    slow = np.outer(B**2, fit.columns[:, 2]) + np.outer(K**2, fit.columns[:, 3])
-    right = (weight * (fit.rest() - slow)) @ fast_columns
+    slow = np.outer(B**2, bands.columns[:, B_TERM]) + np.outer(K**2, bands.columns[:, K_TERM])
+    right = (weight * (bands.rest() - slow)) @ fast_columns
     best = np.linalg.solve(normal, right.T).T
     best_without_q = np.linalg.solve(without_q, right[:, 1:].T).T
     best_without_q[:, 0] = np.maximum(best_without_q[:, 0], 1e-12 * float(spectrum.max()) / HOUR)
     is_inside = np.all(best[:, :2] > 0.0, axis=1)
     used = np.where(is_inside[:, None], best, np.pad(best_without_q, ((0, 0), (1, 0))))
-    expected = used @ fast_columns.T + slow + (fit.power - fit.rest())
-    if free_columns.shape[1] or fit.known is not None:
-        expected = np.maximum(expected, _MIN_POWER_RATIO * spectrum)
-    likelihood = -(fit.weight * (np.log(expected) + fit.power / expected)).sum(axis=1)
+    expected = used @ fast_columns.T + slow + (bands.power - bands.rest())
+    if free_columns.shape[1] or bands.fixed_power is not None:
+        expected = np.maximum(expected, _MIN_POWER_WITH_EFFECTS * spectrum)
+    likelihood = -(bands.weight * (np.log(expected) + bands.power / expected)).sum(axis=1)
     if free_columns.shape[1]:
         normal = np.linalg.inv(np.linalg.inv(normal)[:2, :2])
     return likelihood, best[:, :2], normal
@@ -296,7 +308,7 @@ def _draw_positive(square: Floats, information: Floats, rng: np.random.Generator
 
 
 def noise_posterior(
-    fit: Fit,
+    bands: BandPowers,
     blocks: xr.Dataset,
     row: int,
     variance: Floats,
@@ -309,7 +321,7 @@ def noise_posterior(
 
     Parameters
     ----------
-    fit : Fit
+    bands : BandPowers
         The powers.
     variance : ndarray, shape (block,)
         White variance of the means [degree2 hour-2].
@@ -323,10 +335,10 @@ def noise_posterior(
     mean, step = blocks["mean"].values[row], float(blocks.attrs["block_s"])
     present = use & np.isfinite(mean)
     rng = np.random.default_rng(0)  # of any axis, so that their order does not matter
-    square, information, spectrum = fit_squares(fit)
-    density = HOUR * float(with_floor(square, fit)[1])
-    coarse_K, coarse_B = fine_grid(density, mean.size * step, step)
-    K, B = (axis_values.ravel() for axis_values in np.meshgrid(coarse_K, coarse_B, indexing="ij"))
+    square, information, spectrum = fit_squares(bands)
+    density = HOUR * float(with_floor(square, bands)[N_TERM])
+    K_values, B_values = fine_grid(density, mean.size * step, step)
+    K, B = (points.ravel() for points in np.meshgrid(K_values, B_values, indexing="ij"))
     means = AxisMeans(
         np.where(present, mean, 0.0)[:, None],
         effects,
@@ -339,26 +351,28 @@ def noise_posterior(
     with_angle = means.with_angle_noise(K, B, slow, settings.ambiguous_nats)
     if with_angle is not means:
         means, slow = with_angle, with_angle.log_likelihood(K, B)
-    fast, best, normal = _likelihood_of_powers(fit, spectrum, K, B)
-    is_in_grid = square[3] <= K.max() ** 2 and square[2] <= B.max() ** 2
-    fast_max = fast.max() if is_in_grid else _log_likelihood(fit, spectrum)
+    fast, best, normal = _likelihood_of_powers(bands, spectrum, K, B)
+    is_in_grid = square[K_TERM] <= K.max() ** 2 and square[B_TERM] <= B.max() ** 2
+    fast_max = fast.max() if is_in_grid else _log_likelihood(bands, spectrum)
     joined = bool(slow.max() + fast_max - (slow + fast).max() < settings.disagreement_nats)
     log = slow + fast if joined else slow
     weight = np.exp(log - log.max())
     weight /= weight.sum()
     cell = rng.choice(weight.size, DRAWS, p=weight)
     jitter = rng.random((DRAWS, 2)) - 0.5
-    inner = np.exp(2.0 * jitter * np.log([coarse_B[1] / coarse_B[0], coarse_K[1] / coarse_K[0]]))
+    # each draw lies anywhere in its cell of the grid; squares move twice as far as B and K
+    inner = np.exp(2.0 * jitter * np.log([B_values[1] / B_values[0], K_values[1] / K_values[0]]))
     slow_draws = np.stack([B[cell] ** 2, K[cell] ** 2], axis=1) * inner
     scale = np.sqrt(np.diag(information))
     covariance = np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale)
     error = np.sqrt(np.diag(covariance))
     if joined:
-        spread = np.asarray(np.linalg.inv(normal), np.float64)
-        squares = np.concatenate([_draw_near(best[cell], spread, rng), slow_draws], axis=1)
+        fast_covariance = np.asarray(np.linalg.inv(normal), np.float64)
+        fast_draws = _draw_near(best[cell], fast_covariance, rng)
+        squares = np.concatenate([fast_draws, slow_draws], axis=1)
     else:
         squares = _draw_positive(square, information, rng)
-    squares[:, 1] = np.maximum(squares[:, 1], 0.01 * square[1])
+    squares[:, N_TERM] = np.maximum(squares[:, N_TERM], _MIN_DRAWN_SHARE * square[N_TERM])
     return Posterior(
         square, error, K, B, weight, squares, slow_draws, joined, angle=float(means.wander.angle)
     )

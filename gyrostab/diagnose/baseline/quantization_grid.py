@@ -56,10 +56,10 @@ def _rounded_by_spectrum(
         baseline = calibrate_noise(blocks, settings=settings)
     rate = float(blocks.attrs["sampling_rate_hz"])
     white = baseline["square"].sel(noise="N").values * HOUR * rate
-    quiet = baseline["quiet"].values
+    quiescent = baseline["quiet"].values
     share = np.ones(step.size)
     for row, mean in enumerate(blocks["mean"].values):
-        good = quiet[row] & np.isfinite(mean)
+        good = quiescent[row] & np.isfinite(mean)
         if step[row] > 0.0 and good.any():
             scatter = math.sqrt(white[row]) / step[row]
             share[row] = angle_share(mean[good] / step[row], scatter).mean()
@@ -86,18 +86,18 @@ def _fit_q_square(blocks: xr.Dataset, baseline: xr.Dataset) -> Floats:
     """Return the Q^2 that fits the quiescent powers best; negative if they fall at the end."""
     out = []
     for number in range(blocks.sizes["axis"]):
-        quiet = baseline["quiet"].values[number]
-        power, shape = (blocks[name].values[number][quiet] for name in ("power", "shape"))
-        columns = baseline["columns"].values[number][quiet]
-        fit = average_blocks(power, shape, columns)
-        square = fit_squares(fit)[0]
-        weight = fit.weight / (fit.columns @ square) ** 2
+        quiescent = baseline["quiet"].values[number]
+        power, shape = (blocks[name].values[number][quiescent] for name in ("power", "shape"))
+        columns = baseline["columns"].values[number][quiescent]
+        bands = average_blocks(power, shape, columns)
+        square = fit_squares(bands)[0]
+        weight = bands.weight / (bands.columns @ square) ** 2
         used = (square > 0.0) | np.array([True, True, False, False])
-        normal = (fit.columns.T * weight) @ fit.columns
-        right = (fit.columns.T * weight) @ fit.power
+        normal = (bands.columns.T * weight) @ bands.columns
+        right = (bands.columns.T * weight) @ bands.power
         out.append(
             np.linalg.lstsq(normal[np.ix_(used, used)], right[used], rcond=None)[0][0]
-            if fit.power.size
+            if bands.power.size
             else np.nan
         )
     return np.array(out)

@@ -11,8 +11,7 @@ import xarray as xr
 
 from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.predict.windows import fill_linearly
-from gyrostab.diagnose.reduce.block_statistics import iso
-from gyrostab.diagnose.reduce.schema import weighted_mean
+from gyrostab.diagnose.reduce.schema import format_time, weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError
 from gyrostab.time.stamps import stamp_ns
@@ -21,6 +20,8 @@ from gyrostab.time.stamps import stamp_ns
 LEVEL_SPANS = (1, 5, 15)
 _MIN_GIVEN_SAMPLES = 100  # as in the shortest default block; they give N to 7 %
 _MIN_GIVEN_BANDS = 4  # with a spectrum: as many as noise terms are fitted to them
+_TYPICAL_ROUNDS = 3  # in which the typical spectrum is found again without noisy blocks
+_MIN_RECORD_SETTLINGS = 10.0  # length of the record, over the time after a restart that is left out
 
 
 def _running_sum(values: Floats, count: int) -> Floats:
@@ -65,7 +66,7 @@ def _distance_from_rest(blocks: xr.Dataset, settings: Settings) -> list[Floats]:
     if blocks.sizes.get("restart", 0):
         since = blocks["begin"].values[:, None] - blocks["restart_end"].values
         since = np.where(since < -step, np.inf, np.maximum(since, 1.0)).min(axis=1)
-        settling = min(settings.after_restart_s, _record_length(blocks) / 10.0)
+        settling = min(settings.after_restart_s, _record_length(blocks) / _MIN_RECORD_SETTLINGS)
         distances.append(settling / since)
     return distances
 
@@ -126,7 +127,7 @@ def _drop_noisy_blocks(blocks: xr.Dataset, start: Bools, settings: Settings) -> 
     power, shape = blocks["power"].values, blocks["shape"].values
     quiescent = np.broadcast_to(start, power.shape[:2]).copy()
     for row in range(len(power)):
-        for _ in range(3):
+        for _ in range(_TYPICAL_ROUNDS):
             typical = _typical_spectrum(power[row][quiescent[row]], shape[row][quiescent[row]])
             if typical is None:
                 break
@@ -242,8 +243,13 @@ def _seconds_since_start(blocks: xr.Dataset, edge: Any) -> float:
     return float((instant - start) / np.timedelta64(1, "ns")) / 1e9
 
 
-def find_quiescent_spans(blocks: xr.Dataset, quiet: Bools) -> list[list[str]]:
+def find_quiescent_spans(blocks: xr.Dataset, quiescent: Bools) -> list[list[str]]:
     """Return the spans in which any axis is quiescent, [start, end] as ISO times."""
-    edges = np.flatnonzero(np.diff(quiet.any(axis=0), prepend=False, append=False)).reshape(-1, 2)
+    edges = np.flatnonzero(np.diff(quiescent.any(axis=0), prepend=False, append=False)).reshape(
+        -1, 2
+    )
     begin, end = blocks["begin"].values, blocks["end"].values
-    return [[iso(blocks, begin[first]), iso(blocks, end[last - 1])] for first, last in edges]
+    return [
+        [format_time(blocks, begin[first]), format_time(blocks, end[last - 1])]
+        for first, last in edges
+    ]

@@ -9,10 +9,10 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Complexes
-from gyrostab.diagnose.baseline.known_effects import EVERYWHERE
+from gyrostab.diagnose.baseline.known_effects import GRID_MARK
 from gyrostab.diagnose.estimate.joint_fit import Fitted
-from gyrostab.diagnose.identify.examination import Identifications
-from gyrostab.diagnose.identify.identification import (
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import (
     Selection,
     components_of,
     condition_on_selections,
@@ -38,7 +38,7 @@ from gyrostab.physics.registry import effects
 def predict_baseline(
     identifications: Identifications,
     baseline: xr.Dataset,
-    known: Bools | None = None,
+    training: Bools | None = None,
     *,
     left_out: Sequence[Selection] = (),
 ) -> xr.Dataset:
@@ -48,7 +48,7 @@ def predict_baseline(
     ----------
     identifications : Identifications
         The effects, with those that were expected; their nuisance parameters are kept.
-    known : ndarray of bool, shape (block,), optional
+    training : ndarray of bool, shape (block,), optional
         Blocks that the sizes are fitted to; all by default.
     left_out : sequence of Selection, optional
         Effects that are fitted with the others and then taken out again. What a low-pass removed
@@ -62,7 +62,9 @@ def predict_baseline(
     """
     blocks = identifications.state.blocks
     keep = (
-        np.ones(blocks.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
+        np.ones(blocks.sizes["block"], np.bool_)
+        if training is None
+        else np.asarray(training, np.bool_)
     )
     usable_blocks = blocks.copy()
     for name in ("mean", "power", "cross"):
@@ -74,14 +76,14 @@ def predict_baseline(
     states = conditioned_states(state, identified)
     for identification, state in zip(identified, states, strict=True):
         for place, columns in state.given.items():
-            known_of = is_left_out.setdefault(place, [])
-            known_of += [identification in left_out] * (len(columns) - len(known_of))
-    weight = state.weight.copy()
+            flags = is_left_out.setdefault(place, [])
+            flags += [identification in left_out] * (len(columns) - len(flags))
+    spectrum = state.expected_power.copy()
     for row, axis in enumerate(state.axes):
         places = (("power", axis), ("added_power", axis))  # as in `State.power_columns`
         dropped = np.array([flag for at in places for flag in is_left_out.get(at, [])], np.bool_)
         if dropped.any():
-            weight[row] = fit_powers(state, axis, dropped)
+            spectrum[row] = fit_powers(state, axis, dropped)
     state = replace(state, blocks=usable_blocks, masked=identifications.state.masked)
     empty_state = replace(state, given={})
     mean = baseline["known_mean"].values.copy()
@@ -92,7 +94,7 @@ def predict_baseline(
             size, _ = mean_mixture(empty_state, axis, columns).moments()
             mean[row] += np.tensordot(size[is_kept], np.stack(columns)[is_kept], axes=1)
     predicted = state.baseline.assign(
-        spectrum=baseline["spectrum"].copy(data=weight),
+        spectrum=baseline["spectrum"].copy(data=spectrum),
         known_mean=baseline["known_mean"].copy(data=mean),
     )
     remaining = [identification for identification in identified if identification not in left_out]
@@ -115,7 +117,7 @@ def predict_baseline(
 
 def _cross_spectra(components: Sequence[Component], state: State) -> Complexes:
     """Return the cross-spectra of noise that axes have in common, in a state without effects."""
-    shape = state.weight.shape[1:]
+    shape = state.expected_power.shape[1:]
     pairs = pair_rows(state.blocks)
     total = np.zeros((len(pairs), *shape), np.complex128)
     for component in components:
@@ -127,11 +129,13 @@ def _cross_spectra(components: Sequence[Component], state: State) -> Complexes:
 
 
 def expected_baseline(
-    identifications: Identifications, baseline: xr.Dataset, known: Bools | None = None
+    identifications: Identifications, baseline: xr.Dataset, training: Bools | None = None
 ) -> xr.Dataset:
-    """Return the baseline with the expected effects only, fitted to the `known` blocks."""
+    """Return the baseline with the expected effects only, fitted to the training blocks."""
     return (
-        predict_baseline(replace(identifications, identified=(), unknown=()), baseline, known)
+        predict_baseline(
+            replace(identifications, identified=(), unidentified=()), baseline, training
+        )
         if identifications.expected
         else baseline
     )
@@ -169,7 +173,7 @@ def add_outlier_power(
         prediction = effect_fit.effect.explain(
             replace(make_windows(blocks, {}), axes=tuple(effect_fit.axes))
         )
-        if EVERYWHERE in prediction.marks:
+        if GRID_MARK in prediction.marks:
             continue
         for name, density in prediction.spectrum.items():
             added[rows] += getattr(effect_fit.effect, name) ** 2 * density

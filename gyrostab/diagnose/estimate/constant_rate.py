@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.baseline.expected_statistics import NOISE, PassedNoise, undo_transfer
+from gyrostab.diagnose.baseline.expected_statistics import N_TERM, NOISE, PassedNoise, undo_transfer
 from gyrostab.diagnose.baseline.from_model import expect_ramp, fit_noise_factor
 from gyrostab.diagnose.baseline.known_effects import expect_known_effects
 from gyrostab.diagnose.predict.windows import predict_effect
@@ -96,9 +96,8 @@ def fit_white_noise(
     all_axes = [str(axis) for axis in blocks["axis"].values]
     coefficients = [model.coefficients(axis) for axis in all_axes]
     square = np.array([[of_axis[term] ** 2 for term in NOISE] for of_axis in coefficients])
-    white = NOISE.index("N")
     others = square.copy()
-    others[:, white] = 0.0
+    others[:, N_TERM] = 0.0
     spectrum, added = (
         expect_known_effects(blocks, model, part).spectrum for part in (square, others)
     )
@@ -109,7 +108,7 @@ def fit_white_noise(
         noise = spectrum[row] - added[row]
         fitted = fit_noise_factor(blocks.isel(axis=[row]), noise, added[row], chosen)
         if fitted is not None:
-            out[axis] = math.sqrt(square[row, white] * fitted[0])
+            out[axis] = math.sqrt(square[row, N_TERM] * fitted[0])
     return out
 
 

@@ -10,7 +10,13 @@ from scipy.optimize import minimize_scalar
 
 from gyrostab.arrays import Floats
 from gyrostab.diagnose.baseline.expected_statistics import band_columns, reduced_shape
-from gyrostab.diagnose.baseline.posterior import Fit, average_blocks, choose_filter, fit_behind
+from gyrostab.diagnose.baseline.posterior import (
+    BandPowers,
+    average_blocks,
+    choose_filter,
+    fit_behind,
+)
+from gyrostab.diagnose.predict.average_sizes import Size
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, band_widths, stack_columns, unspread_share
@@ -28,19 +34,19 @@ MIN_ELSEWHERE_SHARE = 0.02  # of the probability, from which on other places wid
 
 def fit_filter_sizes(
     components: Sequence[Component], state: State
-) -> tuple[dict[str, tuple[float, ...]], dict[str, float]]:
+) -> tuple[dict[str, Size], dict[str, float]]:
     """Fit the cutoff or length of a filter to the powers of all its axes, with free noise.
 
     The parameter that is measured has its standard error, and the ends of its 95 % interval where
     several places of the grid fit. The other values are the order, and how the samples are made.
     """
     kind = effects()[components[0].candidate.effect]
-    fits = [_average_powers(component.row[0], state) for component in components]
+    axis_powers = [_average_powers(component.row[0], state) for component in components]
     columns = band_columns(state.blocks)
 
     def fit_all(values: Mapping[str, Any]) -> list[tuple[float, float]]:
         response = band_response(kind.example(**values), state.blocks)
-        return [fit_behind(fit, mixing @ (columns * response)) for fit, mixing in fits]
+        return [fit_behind(bands, mixing @ (columns * response)) for bands, mixing in axis_powers]
 
     def likelihood(values: Mapping[str, Any]) -> float:
         return sum(nats for nats, _ in fit_all(values))
@@ -147,7 +153,7 @@ def _widen_interval(
     return mean, (high - low) / (2.0 * NORMAL_95), low, high
 
 
-def _average_powers(axis: str, state: State) -> tuple[Fit, Floats]:
+def _average_powers(axis: str, state: State) -> tuple[BandPowers, Floats]:
     """Average the powers of an axis over the record, with free noise and effects.
 
     The second result is how gaps mix the bands of the noise.
@@ -155,7 +161,7 @@ def _average_powers(axis: str, state: State) -> tuple[Fit, Floats]:
     blocks, row = state.blocks, state.axes.index(axis)
     power, shape = blocks["power"].values[row], reduced_shape(blocks)[row]
     effects_of_axis = state.power_columns(axis)
-    columns = [unspread_share(blocks)[row, :, None], state.weight[row], *effects_of_axis]
+    columns = [unspread_share(blocks)[row, :, None], state.expected_power[row], *effects_of_axis]
     averaged = average_blocks(
         power,
         np.where(state.masked[row][:, None], np.nan, shape),

@@ -14,14 +14,16 @@ from scipy.special import ndtr, ndtri
 from gyrostab.diagnose.estimate.filter_sizes import fit_filter_sizes
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import axes_of
-from gyrostab.diagnose.identify.examination import Identifications
-from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import Selection
+from gyrostab.diagnose.predict.average_sizes import Size
 from gyrostab.diagnose.predict.candidates import TIME_PARAMETER, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on_components
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes
+from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics import Statistic
-from gyrostab.diagnose.statistics.base import SizeFit
+from gyrostab.diagnose.statistics.base import SizeFit, Sizes
 from gyrostab.diagnose.statistics.rotation_order import fit_amplitude, harmonic_sets, is_reversed
 from gyrostab.diagnose.statistics.sample_sizes import (
     are_simultaneous,
@@ -44,7 +46,7 @@ _FIXED_SETTINGS: Mapping[str, dict[str, Any]] = {
     "misalignment": {"motion": "recorded"},
     "spikes": {"kind": "outlier"},
 }
-_PLACE = "frequency"  # of a line: where it is does not depend on what makes it
+_FREQUENCY = "frequency"  # of a line, which does not depend on what makes it
 MAX_BLOCKS_OF_STEP = 2  # by which the times of a step on two axes may differ; design choice
 
 
@@ -90,8 +92,9 @@ class Fitted:
 def fit_identifications(identifications: Identifications, baseline: xr.Dataset) -> list[Fitted]:
     """Fit all identified effects, each with the others in the model.
 
-    An effect with a single size for all of its axes has one entry per axis. It has one for all axes
-    where each has its own size, or where it changes samples at the same instants.
+    An effect whose class takes one number as its size is fitted on each axis alone, and has one
+    entry per axis. It has one entry for all axes if its size has one value per axis, if it is a
+    filter or noise that axes have in common, or if it changes samples at the same instants.
     """
     return [
         fitted
@@ -104,6 +107,7 @@ def fit_identifications(identifications: Identifications, baseline: xr.Dataset) 
 
 def fit_expected(identifications: Identifications, baseline: xr.Dataset) -> list[Fitted]:
     """Fit the expected effects with all identified ones in the model."""
+    # fit_identifications fits what is identified, with what is expected in the model
     swapped = replace(
         identifications, identified=identifications.expected, expected=identifications.identified
     )
@@ -113,6 +117,7 @@ def fit_expected(identifications: Identifications, baseline: xr.Dataset) -> list
 def _fit_identification(
     identification: Selection, state: State, identifications: Identifications
 ) -> list[Fitted]:
+    """Fit one identification: all axes together, or each group of axes alone."""
     kind = effects()[identification.effect]
     fitted_together = any(
         item.many for item in kind.parameters() if item.name in kind.size_parameters
@@ -141,10 +146,10 @@ def _fit_identification(
             identification,
             axes_of(components, identification.axes),
             components,
-            state_beside,
+            with_others,
             identifications,
         )
-        for components, state_beside in parts
+        for components, with_others in parts
     ]
 
 
@@ -155,23 +160,16 @@ def _fit_components(
     state: State,
     identifications: Identifications,
 ) -> Fitted:
+    """Fit the components of one entry, in the statistic that shows its size best."""
     kind = effects()[identification.effect]
-    parameters = {item.name: item for item in kind.parameters()}
     values: dict[str, Any] = {}
     likeliest: dict[str, Any] = {}
-    estimates: dict[str, Estimate] = {}
     by_statistic: dict[Statistic, list[Component]] = {}
     for component in components:
         by_statistic.setdefault(component.statistic, []).append(component)
-    statistic = max(  # one size for all axes before sizes that each axis has for itself
-        by_statistic,
-        key=lambda name: (
-            not by_statistic[name][0].candidate.is_per_axis,
-            sum(component.evidence_nats for component in by_statistic[name]),
-        ),
-    )
+    statistic = _strongest_statistic(by_statistic)
     filtered = by_statistic[statistic][0].is_filter
-    sizes: Mapping[str, tuple[float, ...]]
+    sizes: Sizes
     if filtered:
         sizes, values = fit_filter_sizes(by_statistic[statistic], state)
     else:
@@ -184,19 +182,8 @@ def _fit_components(
             **_sizes_on_other_axes(by_statistic, statistic, axes, state, identifications),
             **own_sizes,
         }
-    for name, (mean, sd, *ends) in sizes.items():
-        parameter = parameters.get(name.split(".")[0])
-        unit = parameter.unit if parameter else "1"
-        # a low-pass of infinite bandwidth is not given; nor is an exponent that was not measured
-        if math.isfinite(mean) and not math.isnan(sd):
-            # the error of an angle contains it
-            is_exact = unit == _ANGLE or (statistic.is_line and name == _PLACE)
-            form = 0.0 if is_exact else state.settings.size_error_share * mean
-            positive = parameter is not None and parameter.low >= 0.0
-            estimates[name] = _make_estimate(
-                mean, sd, unit, ends=ends, positive=positive, form=form
-            )
-        _store_value(values, name, mean, axes)
+    for name, (value, *_) in sizes.items():
+        _store_value(values, name, value, axes)
     values |= {
         name: value
         for name, value in by_statistic[statistic][0].variant.values.items()
@@ -212,12 +199,43 @@ def _fit_components(
     return Fitted(
         identification,
         axes,
-        estimates,
+        _make_estimates(sizes, kind, statistic, state.settings),
         averaged if effect is None else effect,
         next((component.note for component in by_statistic[statistic] if component.note), ""),
         averaged,
         tuple(components),
     )
+
+
+def _strongest_statistic(by_statistic: Mapping[Statistic, list[Component]]) -> Statistic:
+    """Return the statistic with the most evidence, if possible with one size for all axes."""
+    return max(
+        by_statistic,
+        key=lambda statistic: (
+            not by_statistic[statistic][0].candidate.is_per_axis,
+            sum(component.evidence_nats for component in by_statistic[statistic]),
+        ),
+    )
+
+
+def _make_estimates(
+    sizes: Sizes, kind: type[Effect], statistic: Statistic, settings: Settings
+) -> dict[str, Estimate]:
+    """Return the estimates of all sizes that were measured, with the error of the form."""
+    parameters = {item.name: item for item in kind.parameters()}
+    estimates: dict[str, Estimate] = {}
+    for name, (mean, sd, *ends) in sizes.items():
+        # a low-pass of infinite bandwidth is not given; nor is an exponent that was not measured
+        if not math.isfinite(mean) or math.isnan(sd):
+            continue
+        parameter = parameters.get(name.split(".")[0])
+        unit = parameter.unit if parameter else "1"
+        # the error of an angle contains it
+        is_exact = unit == _ANGLE or (statistic.is_line and name == _FREQUENCY)
+        form = 0.0 if is_exact else settings.size_error_share * mean
+        positive = parameter is not None and parameter.low >= 0.0
+        estimates[name] = _make_estimate(mean, sd, unit, ends=ends, positive=positive, form=form)
+    return estimates
 
 
 def _sizes_on_other_axes(
@@ -226,13 +244,13 @@ def _sizes_on_other_axes(
     axes: tuple[str, ...],
     state: State,
     identifications: Identifications,
-) -> dict[str, tuple[float, ...]]:
+) -> dict[str, Size]:
     """Return sizes on axes that the strongest statistic does not cover, from the next that does."""
     covered_axes = {axis for component in by_statistic[statistic] for axis in component.row}
-    added_sizes: dict[str, tuple[float, ...]] = {}
+    added_sizes: dict[str, Size] = {}
     for other_statistic in sorted(
         set(by_statistic) - {statistic},
-        key=lambda name: -sum(component.evidence_nats for component in by_statistic[name]),
+        key=lambda other: -sum(component.evidence_nats for component in by_statistic[other]),
     ):
         lacking = {
             axis for component in by_statistic[other_statistic] for axis in component.row
@@ -251,7 +269,7 @@ def _estimate_sizes(
     axes: tuple[str, ...],
     state: State,
     identifications: Identifications,
-) -> tuple[Mapping[str, tuple[float, ...]], Mapping[str, float | str]]:
+) -> tuple[Sizes, Mapping[str, float | str]]:
     """Return parameters with their errors from components in one statistic, and likely values."""
     # a step has its own grid of times, which ends where those of other steps begin
     candidates = () if components[0].is_step else identifications.candidates
@@ -275,7 +293,9 @@ def _model_settings(
     """Return settings that the model needs in addition to the sizes."""
     if identification.effect == "spectral_line" and component.statistic.is_line:
         return {
-            "quality": line_quality(state.blocks, state.baseline, component.row[0], component.place)
+            "quality": line_quality(
+                state.blocks, state.baseline, component.row[0], component.line_index
+            )
         }
     if identification.effect == "feedback_reset" and "ramp_turns" in state.blocks:
         return {"phase": "channel"}
@@ -359,9 +379,13 @@ def _split_harmonics(identification: Selection, state: State) -> list[list[Compo
         if component.statistic.is_rotation and component.candidate.is_per_axis
     ]
     sets = harmonic_sets(state.blocks.sizes["harmonic"]) if turning else []
-    harmonics = sorted({k for component in turning for k in sets[component.place]})
+    harmonics = sorted({k for component in turning for k in sets[component.line_index]})
     by_harmonic = [
-        [replace(component, place=k) for component in turning if k in sets[component.place]]
+        [
+            replace(component, line_index=k)
+            for component in turning
+            if k in sets[component.line_index]
+        ]
         for k in harmonics
     ]
     if len(by_harmonic) < 2:

@@ -14,16 +14,17 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Floats
-from gyrostab.diagnose.baseline.calibrate import assemble_baseline
+from gyrostab.diagnose.baseline.calibrate import MIN_MEAN_NOISE_FACTOR, assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import (
+    N_TERM,
     NOISE,
     noise_powers,
     reduced_shape,
     white_variance,
 )
-from gyrostab.diagnose.baseline.known_effects import random_means
+from gyrostab.diagnose.baseline.known_effects import ProcessesOnRows, random_means
 from gyrostab.diagnose.baseline.posterior import (
-    Fit,
+    BandPowers,
     Posterior,
     average_groups,
     fit_squares,
@@ -32,8 +33,8 @@ from gyrostab.diagnose.baseline.posterior import (
 )
 from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_identifications
 from gyrostab.diagnose.evidence.wandering import RandomProcesses, expected_processes
-from gyrostab.diagnose.identify.examination import Identifications
-from gyrostab.diagnose.identify.identification import components_of, condition_on_selections
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import components_of, condition_on_selections
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import State, spread_by_gaps
@@ -49,9 +50,9 @@ LEVEL_GROUPS = 150  # of blocks of similar level, over which powers are averaged
 class AxisEffects:
     """What the effects do on one axis."""
 
-    known: Floats  # (block, band): power of fixed size
+    fixed_power: Floats  # (block, band): power of fixed size
     response: Floats  # (band, term): factor of the noise
-    doubt: float  # relative error of `known`
+    doubt: float  # relative error of `fixed_power`
     free: list[Floats] = field(default_factory=list)  # (block, band): power per unit of a free size
     means: list[Floats] = field(default_factory=list)  # (block,): means per unit of a free size
 
@@ -60,7 +61,7 @@ def recalibrate(
     identifications: Identifications,
     baseline: xr.Dataset,
     fitted: Sequence[Fitted],
-    known: Bools | None = None,
+    training: Bools | None = None,
 ) -> xr.Dataset:
     """Calibrate the noise with the identified effects in the model, those of free size free.
 
@@ -71,42 +72,49 @@ def recalibrate(
 
     The baseline that the identification started from is returned as it is unless it was calibrated
     on the recording. The new one has the steady random processes of the effects in the means;
-    ``attrs["recalibrated"]`` lists its axes. Only blocks `known` (block,) are used, by default all.
+    ``attrs["recalibrated"]`` lists its axes. Only the blocks `training` (block,) are used, by
+    default all.
     """
     if baseline.attrs.get("source") != "calibrated" or not identifications.identified:
         return baseline
     blocks = identifications.state.blocks
-    use = np.ones(blocks.sizes["block"], np.bool_) if known is None else np.asarray(known, np.bool_)
+    use = (
+        np.ones(blocks.sizes["block"], np.bool_)
+        if training is None
+        else np.asarray(training, np.bool_)
+    )
     state = condition_on_selections(
-        identifications.start_state(baseline), identifications.identified
+        identifications.state_without_effects(baseline), identifications.identified
     )
     posteriors: list[Posterior] = []
     power = baseline["spectrum"].values.copy()
     columns = noise_powers(blocks)
     processes = _find_processes(fitted, blocks)
     with_processes = baseline.assign(processes)
-    changed, quiet = [], baseline["quiet"].values.copy()
+    changed, quiescent = [], baseline["quiet"].values.copy()
     for row, axis in enumerate(state.axes):
         axis_effects = _collect_effects(identifications, baseline, fitted, axis)
         posterior = None
         has_walk = expected_processes(state.baseline, row).walk.any()
         if axis_effects is not None and not has_walk:
-            has_unidentified = any(axis in selection.axes for selection in identifications.unknown)
-            chosen = use & ~state.masked[row] & (quiet[row] if has_unidentified else True)
+            has_unidentified = any(
+                axis in selection.axes for selection in identifications.unidentified
+            )
+            chosen = use & ~state.masked[row] & (quiescent[row] if has_unidentified else True)
             wander = expected_processes(with_processes, row)
             posterior = _fit_noise(state, row, axis_effects, chosen, wander)
             if posterior is not None:
                 changed.append(axis)
-                quiet[row] = chosen
+                quiescent[row] = chosen
                 columns[row] = noise_powers(blocks, axis_effects.response)[row]
-                power[row] = columns[row] @ posterior.square + axis_effects.known
+                power[row] = columns[row] @ posterior.square + axis_effects.fixed_power
         posteriors.append(_kept_posterior(baseline, row) if posterior is None else posterior)
     if not changed:
         return baseline
     out = assemble_baseline(
         blocks,
         posteriors,
-        quiet=quiet,
+        quiescent=quiescent,
         attrs={**baseline.attrs, "recalibrated": changed},
         spectrum=power,
         settings=state.settings,
@@ -144,7 +152,7 @@ def remove_fast_switching(identifications: Identifications, baseline: xr.Dataset
     )
     if not switching:
         return baseline
-    switching_only = replace(identifications, identified=switching, unknown=())
+    switching_only = replace(identifications, identified=switching, unidentified=())
     noise = recalibrate(switching_only, baseline, fit_identifications(switching_only, baseline))
     return noise if noise is baseline else noise.assign_attrs(recalibrated=[])
 
@@ -160,14 +168,14 @@ def refer_to_kept_noise(
     if noise.attrs.get("source") != "calibrated":
         return list(fitted)
     recalibrated = noise.attrs.get("recalibrated", ())
-    quiet = dict(zip(noise["axis"].values.tolist(), noise["quiet"].values, strict=True))
+    quiescent = dict(zip(noise["axis"].values.tolist(), noise["quiet"].values, strict=True))
     out = []
     for effect_fit in fitted:
         kept_axes = [axis for axis in effect_fit.axes if axis not in recalibrated]
         if effect_fit.effect is None or effect_fit.effect.stage != "noise" or not kept_axes:
             out.append(effect_fit)
             continue
-        at_rest = quiet[kept_axes[0]]
+        at_rest = quiescent[kept_axes[0]]
         means = {
             role: float(np.nanmean(blocks[f"channel_{name}"].values[at_rest]))
             for role, name in find_drivers(effect_fit.effect).items()
@@ -188,7 +196,17 @@ def _kept_posterior(baseline: xr.Dataset, row: int) -> Posterior:
     weight = np.exp(axis_baseline["grid_calibrated"].values)
     angle = float(axis_baseline["angle_variance"])
     weight /= weight.sum()
-    return Posterior(square, error, K, B, weight, draws, slow, True, angle=angle)
+    return Posterior(
+        square=square,
+        error=error,
+        K=K,
+        B=B,
+        weight=weight,
+        draws=draws,
+        slow=slow,
+        joined=True,
+        angle=angle,
+    )
 
 
 def _collect_effects(
@@ -200,28 +218,24 @@ def _collect_effects(
     # twice the error of the size, because power grows with its square
     doubt = 2.0 * identifications.state.settings.size_error_share
     out = AxisEffects(np.zeros(shape), np.ones((shape[1], len(NOISE))), doubt)
-    start = identifications.start_state(baseline)
+    start = identifications.state_without_effects(baseline)
     touched = False
     for identification in identifications.identified:
         components = [component for component in identification.components if axis in component.row]
         touched |= bool(components)
         for component in components:
             if not component.is_filter:
-                known, free, means = component.statistic.noise_shares(
-                    component, axis, start, identifications.state.weight
+                fixed_power, free, means = component.statistic.noise_shares(
+                    component, axis, start, identifications.state.expected_power
                 )
-                out.known += known
+                out.fixed_power += fixed_power
                 out.free += [np.broadcast_to(column, shape) for column in free]
                 out.means += means
-        numbers = next(
-            (
-                effect_fit
-                for effect_fit in fitted
-                if effect_fit.identification is identification and axis in effect_fit.axes
-            ),
+        effect_fit = next(
+            (fit for fit in fitted if fit.identification is identification and axis in fit.axes),
             None,
         )
-        if numbers is None or numbers.effect is None:
+        if effect_fit is None or effect_fit.effect is None:
             continue
         # power in a statistic of powers has a free size
         is_in_power = any(component.statistic.is_power for component in components)
@@ -229,15 +243,15 @@ def _collect_effects(
             component.statistic.has_power_of_effect(component, identifications.state)
             for component in components
         ):
-            out.known += _effect_power(numbers.effect, blocks, axis)
+            out.fixed_power += _effect_power(effect_fit.effect, blocks, axis)
             errors = [
                 2.0 * estimate.stderr / abs(estimate.value)
-                for estimate in numbers.parameters.values()
+                for estimate in effect_fit.parameters.values()
                 if estimate.value
             ]
             out.doubt = max([out.doubt, *errors])
         if any(component.is_filter for component in components):
-            out.response = out.response * band_response(numbers.effect, blocks)
+            out.response = out.response * band_response(effect_fit.effect, blocks)
     return out if touched else None
 
 
@@ -247,7 +261,7 @@ def _find_processes(fitted: Sequence[Fitted], blocks: xr.Dataset) -> dict[str, A
     The bias of two levels is one unless its course is in the model.
     """
     axes = [str(axis) for axis in blocks["axis"].values]
-    wandering = []
+    processes_on_rows = []
     for effect_fit in fitted:
         effect = effect_fit.effect
         if effect is None:
@@ -256,9 +270,10 @@ def _find_processes(fitted: Sequence[Fitted], blocks: xr.Dataset) -> dict[str, A
         if not any(component.statistic.is_switching for component in effect_fit.components):
             prediction = replace(prediction, levels="")
         sizes = partial(effect.expand_to_axes, axes=effect_fit.axes)
-        wandering.append((prediction, [axes.index(axis) for axis in effect_fit.axes], sizes))
+        rows = [axes.index(axis) for axis in effect_fit.axes]
+        processes_on_rows.append(ProcessesOnRows(prediction, rows, sizes))
     shape = tuple(blocks.sizes[name] for name in ("axis", "block", "band"))
-    return label_variables(random_means(wandering, shape)[0], BASELINE)
+    return label_variables(random_means(processes_on_rows, shape)[0], BASELINE)
 
 
 def _effect_power(effect: Effect, blocks: xr.Dataset, axis: str) -> Floats:
@@ -282,18 +297,24 @@ def _fit_noise(
     if chosen.sum() < MIN_BLOCKS:
         return None
     columns = noise_powers(blocks, axis_effects.response)[row]
-    fit = _average_powers(power, shape, columns, state.weight[row], axis_effects, chosen)
-    square, information, _ = fit_squares(fit)
-    assert fit.start is not None
-    plain = float((fit.weight / np.square(fit.start) * fit.columns[:, 1] ** 2).sum())
-    if not information[1, 1] > state.settings.min_information_share * plain or not square[1] > 0.0:
+    bands = _average_powers(power, shape, columns, state.expected_power[row], axis_effects, chosen)
+    square, information, _ = fit_squares(bands)
+    assert bands.start is not None
+    white_column = bands.columns[:, N_TERM]
+    without_effects = float((bands.weight / np.square(bands.start) * white_column**2).sum())
+    least_information = state.settings.min_information_share * without_effects
+    if not information[N_TERM, N_TERM] > least_information or not square[N_TERM] > 0.0:
         return None
-    square = with_floor(square, fit)
+    square = with_floor(square, bands)
     variance = white_variance(blocks, square[None])[row]
     unfiltered = noise_powers(blocks)[row, :, 0] @ square
-    variance = variance * np.maximum(state.weight[row, :, 0] / unfiltered, 0.1)
+    variance = variance * np.maximum(
+        state.expected_power[row, :, 0] / unfiltered, MIN_MEAN_NOISE_FACTOR
+    )
     effect_means = np.stack(axis_effects.means, axis=1) if axis_effects.means else None
-    return noise_posterior(fit, blocks, row, variance, chosen, effect_means, state.settings, wander)
+    return noise_posterior(
+        bands, blocks, row, variance, chosen, effect_means, state.settings, wander
+    )
 
 
 def _average_powers(
@@ -303,21 +324,25 @@ def _average_powers(
     expected: Floats,
     axis_effects: AxisEffects,
     chosen: Bools,
-) -> Fit:
+) -> BandPowers:
     """Average the powers over blocks of similar level."""
     free_columns = [
         column / max(float(np.abs(column).max()), 1e-300) for column in axis_effects.free
     ]
-    effect_columns = np.stack([axis_effects.known, expected, *free_columns], axis=-1)
+    effect_columns = np.stack([axis_effects.fixed_power, expected, *free_columns], axis=-1)
     cells = np.nan_to_num(np.concatenate([columns, effect_columns], axis=-1))
     level = np.log(expected.mean(axis=1))
-    fit = average_groups(power, shape, cells, level, chosen, LEVEL_GROUPS)
-    columns, (known, start), free = fit.columns[:, :4], fit.columns[:, 4:6].T, fit.columns[:, 6:]
+    bands = average_groups(power, shape, cells, level, chosen, LEVEL_GROUPS)
+    columns, (fixed_power, start), free = (
+        bands.columns[:, :4],
+        bands.columns[:, 4:6].T,
+        bands.columns[:, 6:],
+    )
     precision = np.zeros(free.shape[1])
-    if np.any(known > 0.0):  # the predicted power has an error too
-        free = np.concatenate([free, known[:, None]], axis=1)
+    if np.any(fixed_power > 0.0):  # the predicted power has an error too
+        free = np.concatenate([free, fixed_power[:, None]], axis=1)
         precision = np.append(precision, 1.0 / axis_effects.doubt**2)
-    return Fit(fit.power, columns, fit.weight, known, free, precision, start)
+    return BandPowers(bands.power, columns, bands.weight, fixed_power, free, precision, start)
 
 
 def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identifications:

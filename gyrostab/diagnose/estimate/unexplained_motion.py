@@ -8,13 +8,13 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Floats
-from gyrostab.diagnose.identify.identification import Selection, components_of
+from gyrostab.diagnose.identify.selections import Selection, components_of
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State, band_widths
 from gyrostab.diagnose.reduce.moving_blocks import (
-    moving_blocks,
-    moving_blocks_of_axis,
+    find_moving_blocks,
+    find_moving_blocks_of_axis,
     sample_range,
 )
 from gyrostab.diagnose.reduce.schema import axis_values
@@ -22,7 +22,9 @@ from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 
 
-def unexplained_motion(blocks: xr.Dataset, identified: Iterable[Selection], state: State) -> Bools:
+def find_unexplained_motion(
+    blocks: xr.Dataset, identified: Iterable[Selection], state: State
+) -> Bools:
     """Find the moving blocks (axis, block) of axes without an effect that explains the motion.
 
     An effect must leave next to nothing of the motion, in the means or, where it follows a channel
@@ -39,9 +41,9 @@ def unexplained_motion(blocks: xr.Dataset, identified: Iterable[Selection], stat
         if component.statistic.moves_means(component)
         for axis in component.row
     }
-    moving = moving_blocks(blocks, settings=settings)
+    moving = find_moving_blocks(blocks, settings=settings)
     usual_blocks = mask_anomalous_blocks(blocks, components, settings)
-    moving_as_usual = moving_blocks(usual_blocks, settings=settings)
+    moving_as_usual = find_moving_blocks(usual_blocks, settings=settings)
     span = sample_range(blocks)
     for row, axis in enumerate(map(str, blocks["axis"].values)):
         axis_components = [
@@ -89,7 +91,7 @@ def _explains_power(
     measured = axis_values(state.blocks, "power", axis)
     predicted = np.zeros_like(measured)
     for component in followers:
-        power, *_ = component.statistic.noise_shares(component, axis, state, state.weight)
+        power, *_ = component.statistic.noise_shares(component, axis, state, state.expected_power)
         predicted += power
     good = np.isfinite(measured) & moving[:, None]
     width = np.broadcast_to(band_widths(state.blocks), measured.shape)[good]
@@ -111,7 +113,7 @@ def _is_explained(
     design /= np.maximum(np.abs(design).max(axis=0), 1e-300)
     size, *_ = np.linalg.lstsq(design, mean[good], rcond=None)
     residual = mean[good] - design @ size
-    if not has_form and moving_blocks_of_axis(residual, span, settings).any():
+    if not has_form and find_moving_blocks_of_axis(residual, span, settings).any():
         return False
     away = mean[good] - np.median(mean[good & ~moving])
     is_moving = moving[good]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gyrostab.diagnose.evidence.mixture import Mixture
-from gyrostab.diagnose.identify.examination import Identifications
+from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.predict.average_sizes import plain_places
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import mean_columns

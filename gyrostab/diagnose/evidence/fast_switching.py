@@ -107,18 +107,18 @@ def switching_evidence(
             min_scatter=_MIN_WHITE_RATIO,
             parts=_PARTS_PER_SUB_BLOCK,
         )
-        evidence_nats, beyond = _course_gains(
+        evidence_nats, beyond_normal_nats = _course_evidence(
             courses, flat, variance, present, effect_columns, step, baseline.sel(axis=axis)
         )
         evidence_nats -= np.log(2.0)
         share = np.repeat(courses.share[0].reshape(shape), merged, axis=1)
         levels_found = courses.switch_count[0] >= settings.min_switches and evidence_nats > 0.0
         similar = levels_found and _is_like_two_levels(courses, variance, present, settings)
-        is_switching = similar and beyond > settings.two_level_nats
+        is_switching = similar and beyond_normal_nats > settings.two_level_nats
         refuted = (
             levels_found
             and evidence_nats > settings.refuting_nats
-            and (not similar or beyond < -settings.refuting_nats)
+            and (not similar or beyond_normal_nats < -settings.refuting_nats)
         )
         result = SwitchingEvidence(
             evidence_nats if is_switching else -np.inf,
@@ -197,7 +197,7 @@ def _sub_block_means(
     return values, np.where(enough, variance, np.nan), merged
 
 
-def _course_gains(
+def _course_evidence(
     courses: TelegraphCourses,
     values: Floats,
     variance: Floats,

@@ -2,15 +2,15 @@
 
 The data are block means, ``y ~ Normal(X beta, V)`` with V from
 `gyrostab.kernels.regression.state_space`, and band powers, ``P / S - 1 ~ Normal(X beta, 1 /
-shape)`` in every cell. Factors beta have a normal prior whose width is one of `prior_widths` times
-the error of beta in white noise. Widths, and random walk K and flicker B on a grid, are averaged
-over. A design therefore enters only by products of whitened columns. They take time linear in the
-number of blocks, and records with the same gaps share them.
+shape)`` in every cell. The sizes beta have a normal prior whose width is one of `prior_widths`
+times the error of beta in white noise. Widths, and random walk K and flicker B on a grid, are
+averaged over. A design therefore enters only by products of whitened columns. They take time linear
+in the number of blocks, and records with the same gaps share them.
 
 A *design* is an array of columns, a *candidate* a list of designs, one for every value of its
-nuisance parameters, of equal weight. The *factor* of a design is its log Bayes factor against the
-model without it, and the held-out evidence of a candidate is the sum over the folds of the loss of
-its factor when the fold is held out.
+nuisance parameters, of equal weight. A *factor* is always a log Bayes factor [nats], that of a
+design against the model without it. The held-out evidence of a candidate is the sum over the folds
+of the loss of its factor when the fold is held out.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from gyrostab.diagnose.evidence.products import (
     Products,
     axis_noise,
     column_pairs,
-    factor_errors,
     log_evidence,
     marginalise,
     mean_products,
     power_products,
     prior_widths,
     remove_common_part,
+    size_errors,
 )
 from gyrostab.diagnose.evidence.wandering import RandomProcesses
 from gyrostab.diagnose.reduce.schema import axis_values
@@ -42,6 +42,9 @@ from gyrostab.diagnose.reduce.schema import axis_values
 #: "free": the noise may differ from the calibrated one (to name an effect); "calibrated": it is the
 #: calibrated one (to detect an effect).
 Tier = Literal["free", "calibrated"]
+#: Standard deviation by which each squared coefficient may change, in units of its value and error;
+#: `noise_columns` gives the reasons. That of N leaves it free.
+_FREEDOM = {"Q": 1.0, "N": 1e3, "B": 3.0, "K": 3.0}
 
 
 def _number_columns(designs: Sequence[Floats]) -> list[Ints]:
@@ -115,10 +118,10 @@ def mean_factors(
     )
     widths = prior_widths(white.square)
     raw_square = (columns[present] ** 2 / setup["variance"][present, None]).sum(axis=0)
-    errors = factor_errors(raw_square, np.diagonal(white.gram[0]))[design_width:]
+    errors = size_errors(raw_square, np.diagonal(white.gram[0]))[design_width:]
     precision = np.diag(1.0 / np.square(np.where(errors > 0.0, errors, 1.0) * widths[-1]))
     without_given = marginalise(white, columns_given.shape[1], precision)
-    limits = factor_errors(raw_square[:design_width], np.diagonal(without_given.gram[0]))
+    limits = size_errors(raw_square[:design_width], np.diagonal(without_given.gram[0]))
     log_weight = noise_weight(baseline, axis, tier)
     subsets = fold_subsets(fold_blocks(data) if folds is None else folds)
     by_subset = (
@@ -177,7 +180,7 @@ def noise_columns(baseline: xr.Dataset, *, axis: str) -> tuple[Floats, Floats, F
     square = axis_values(baseline, "square", axis)
     error = axis_values(baseline, "square_stderr", axis)
     names = [str(name) for name in baseline["noise"].values]
-    freedom = np.array([{"Q": 1.0, "N": 1e3, "B": 3.0, "K": 3.0}[name] for name in names])
+    freedom = np.array([_FREEDOM[name] for name in names])
     if "posterior" in baseline:
         within = axis_values(baseline, "posterior", axis).std(axis=0)
         error = np.where(np.array(names) == "Q", np.minimum(error, within), error)
@@ -239,7 +242,7 @@ def linear_model_factors(model: LinearModel, folds: xr.DataArray) -> Floats:
     widths = prior_widths(total.square)
     precision = _fill_free_precision(model.precision, raw_square[design_width:], widths[-1])
     without_given = marginalise(total, count, precision)
-    limits = factor_errors(raw_square[:design_width], np.diagonal(without_given.gram[0]))
+    limits = size_errors(raw_square[:design_width], np.diagonal(without_given.gram[0]))
     subset_products = [total]
     for length in range(classes.shape[1]):
         for number in range(FOLDS):

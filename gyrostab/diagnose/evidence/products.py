@@ -17,7 +17,7 @@ from gyrostab.kernels.regression.evidence import mixed_evidence, row_products
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.units import HOUR
 
-#: Standard deviations of the prior of a factor, in units of its error in white noise. Design
+#: Standard deviations of the prior of a size, in units of its error in white noise. Design
 #: choice: a mixture over three decades needs no prior size.
 WIDTHS = (1.0, 10.0, 100.0, 1000.0)
 #: Largest width for stronger data. Design choice: given columns that are nearly the same are still
@@ -39,7 +39,7 @@ class Products(NamedTuple):
 
 
 def prior_widths(square: Floats) -> Floats:
-    """Return `WIDTHS`, with the last one as large as any factor of data with these squares can be.
+    """Return `WIDTHS`, with the last one as large as any size of data with these squares can be.
 
     Examples
     --------
@@ -69,8 +69,8 @@ def marginalise(products: Products, given: int, precision: Floats) -> Products:
     )
 
 
-def factor_errors(before: Floats, after: Floats) -> Floats:
-    """Return the error of every factor in white noise [1 / unit of its column], 0 if invisible.
+def size_errors(before: Floats, after: Floats) -> Floats:
+    """Return the error of every size in white noise [1 / unit of its column], 0 if invisible.
 
     `before` and `after` are the squares of the columns, without and with the constant and the given
     columns projected out.
@@ -120,7 +120,7 @@ def mean_products(
     n, width = columns.shape
     stacked = np.ascontiguousarray(np.concatenate([columns, values], axis=1))
     stacked[~present] = 0.0
-    spread = np.where(present, variance, 1.0)
+    white_variance = np.where(present, variance, 1.0)
     share, time, white = flicker_states(step, n * step)
     steps = np.full(n, step)
     if wander is None:
@@ -134,7 +134,7 @@ def mean_products(
         used = slice(0 if b > 0.0 else share.size, None)
         whitened, determinant[g] = whiten(
             stacked,
-            spread + b * white,
+            white_variance + b * white,
             steps,
             present,
             k + wander.walk,
@@ -215,8 +215,8 @@ def log_evidence(
 ) -> Floats:
     """Compute the log marginal likelihood without any design, and with each, (1 + design, record).
 
-    A design is the indices of its columns, and may have factors that cannot be negative. The limits
-    (column,) are the errors of the factors in white noise, 0 for columns without effect. The log
+    A design is the indices of its columns, and may have sizes that cannot be negative. The limits
+    (column,) are the errors of the sizes in white noise, 0 for columns without effect. The log
     weights of the grid points (grid,) are not normalised. The widths are those of `prior_widths`.
     """
     bounded = np.array(is_bounded, np.bool_) if len(is_bounded) else np.zeros(len(designs), bool)
@@ -271,10 +271,10 @@ def _equal_size_evidence(
 def _bounded_evidence(
     base: Floats, rotated: Floats, eigenvalues: Floats, vectors: Floats, widths: Floats
 ) -> Floats:
-    """Compute the log marginal likelihoods (design, record) of factors that cannot be negative.
+    """Compute the log marginal likelihoods (design, record) of sizes that cannot be negative.
 
     Their prior is the positive half of the normal one. The likelihood changes by the share of the
-    posterior that is positive, divided by that of the prior, each as if the factors were
+    posterior that is positive, divided by that of the prior, each as if the sizes were
     independent.
 
     `rotated` (grid, design, column, record) is ``x' y`` in the frame of the eigenvectors of ``x'

@@ -13,9 +13,9 @@ from gyrostab.arrays import Array, Bools, Floats
 from gyrostab.diagnose.evidence.folds import FOLDS
 
 #: Counts that effects raise.
-COUNTS = ("outliers", "repeats", "extremes", "stuck", "filled")
+RAISED_COUNTS = ("outliers", "repeats", "extremes", "stuck", "filled")
 #: What null records have by chance.
-EXPECTED = (*COUNTS, "kurtosis")
+EXPECTED = (*RAISED_COUNTS, "kurtosis")
 #: Statistics of the distribution that a coarse quantization grid changes.
 GRID_COUNTS = ("repeats", "extremes", "zeros", "stuck", "filled", "kurtosis")
 #: Counts of `GRID_COUNTS` whose number by chance follows from the scatter of normal noise.

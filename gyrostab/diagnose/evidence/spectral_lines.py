@@ -26,7 +26,7 @@ def expected_lines(baseline: xr.Dataset, frequency: Array) -> Array:
     smooth = interpolate_bands(spectrum, frequency, baseline["frequency"].values)
     if "line_shape" in baseline:
         smooth = smooth * baseline["line_shape"].values
-    return smooth + baseline["peaks"].values if "peaks" in baseline else smooth
+    return smooth + baseline["broad_peaks"].values if "broad_peaks" in baseline else smooth
 
 
 def interpolate_bands(values: Array, frequency: Array, bands: Array) -> Array:

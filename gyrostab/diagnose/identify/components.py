@@ -29,7 +29,7 @@ def find_components(
             evidence.best[number],
             evidence.rows[number],
             float(evidence_nats[number]),
-            int(evidence.place[0, number]) if evidence.place.size else -1,
+            int(evidence.line_index[0, number]) if evidence.line_index.size else -1,
             close=_close_variants(evidence, number, settings),
         )
         for number in rows
@@ -127,14 +127,15 @@ def renew_component(component: Component, components: Sequence[Component]) -> Co
     reference channel counts.
     """
     for other in components:
-        if _place_of(other) == _place_of(component):
+        if _slot_of(other) == _slot_of(component):
             is_switching = component.statistic.is_switching
             variant = other.variant if is_switching else component.variant
             return replace(component, evidence_nats=other.evidence_nats, variant=variant)
     return component
 
 
-def _place_of(component: Component) -> tuple[object, ...]:
+def _slot_of(component: Component) -> tuple[object, ...]:
+    """Return what a layer of components has once: the statistic, the row and the reference."""
     return component.statistic, component.row, component.candidate.reference
 
 
@@ -159,9 +160,9 @@ def split_layers(components: Sequence[Component]) -> list[list[Component]]:
     out: list[list[Component]] = []
     occurrences: Counter[tuple[object, ...]] = Counter()
     for component in components:
-        place = _place_of(component)
-        if occurrences[place] == len(out):
+        slot = _slot_of(component)
+        if occurrences[slot] == len(out):
             out.append([])
-        out[occurrences[place]].append(component)
-        occurrences[place] += 1
+        out[occurrences[slot]].append(component)
+        occurrences[slot] += 1
     return out

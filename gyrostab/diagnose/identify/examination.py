@@ -1,8 +1,8 @@
-"""What all steps of the selection share, the record and its candidates, and what they find."""
+"""What all steps of the identification share: the record, its candidates and the threshold."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,29 +13,22 @@ from gyrostab.diagnose.baseline.quantization_grid import rounded_rates
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import EXPECTED, CountEvidence, has_coarse_grid
 from gyrostab.diagnose.identify.components import group_components
-from gyrostab.diagnose.identify.identification import Selection, condition_on_selections, form_error
+from gyrostab.diagnose.identify.selections import Selection, condition_on_selections, form_error
 from gyrostab.diagnose.nulls.scores import fit_best_evidence
-from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
+from gyrostab.diagnose.predict.candidates import (
+    NUISANCE_ALTERNATIVES,
+    Candidate,
+    CandidateEvidence,
+    Component,
+)
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS
-from gyrostab.diagnose.statistics.candidates import effect_candidates
-from gyrostab.diagnose.statistics.wording import COARSE_ANGLE_GRID
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
+from gyrostab.diagnose.statistics.mismatch_wording import COARSE_ANGLE_GRID
 from gyrostab.physics.base import Effect
 from gyrostab.progress import Stage, no_stage
-
-#: Name -> description, in the order in which they are tried.
-NUISANCE_ALTERNATIVES = {
-    "~bias(t)": "the bias wanders",
-    "~levels": "the bias steps between several levels",
-    "~N(t)": "the noise level changes",
-    "~burst": "the noise level is higher for a while",
-    "~S(f)": "the spectrum has another shape",
-    "~outliers": "the distribution has heavy tails",
-    "~cov": "the axes have noise in common",
-    "~red": "the bias wanders far beyond its noise",
-}
 
 
 @dataclass(frozen=True)
@@ -47,11 +40,12 @@ class Examination:
     count_evidence: CountEvidence
     threshold: float  # evidence [nats] that noise alone exceeds with the false-alarm probability
     start: State  # with the expected effects in the model, once they are identified
-    known: tuple[Effect, ...] = ()  # effects that the simulation contains but not the baseline
+    #: Effects that the simulation contains but not the baseline.
+    model_effects: tuple[Effect, ...] = ()
     #: Best evidence in each null record, sorted [nats].
     null_best: Array = field(default_factory=lambda: np.empty(0))
     reasons: dict[str, str] = field(default_factory=dict)  # effect -> why it cannot show
-    expected: tuple[Selection, ...] = ()  # those of the known effects that the record shows
+    expected: tuple[Selection, ...] = ()  # those of the model that the record shows
 
     @property
     def settings(self) -> Settings:
@@ -86,35 +80,6 @@ class Examination:
         return self.threshold + form_error(components, others, settings=self.settings)
 
 
-@dataclass(frozen=True)
-class Identifications:
-    """What the identification found."""
-
-    examination: Examination  # with the expected effects in the model
-    identified: tuple[Selection, ...]  # the strongest first
-    unknown: tuple[Selection, ...]
-    state: State  # with all of the above, and the expected effects, in the model
-    candidates: tuple[Candidate, ...]  # all that were tried, for the noise of the state
-    #: Effects that the simulation contains as well, with size and time from the recording.
-    expected: tuple[Selection, ...] = ()
-    #: Key of each candidate that passed the threshold and was not selected -> another form or a
-    #: time-shifted channel, and by how much it explained more [nats].
-    beaten: Mapping[str, tuple[str, float]] = field(default_factory=dict)
-
-    def start_state(self, baseline: xr.Dataset) -> State:
-        """Return the state without any effect."""
-        return initial_state(self.state.blocks, baseline, settings=self.state.settings)
-
-    def state_without(self, identification: Selection, baseline: xr.Dataset) -> State:
-        """Return the state with all selections but one in the model, weighted with all of them."""
-        chosen: list[Selection] = [*self.expected, *self.identified, *self.unknown]
-        return replace(
-            condition_on_selections(self.start_state(baseline), chosen, identification),
-            weight=self.state.weight,
-            masked=self.state.masked,
-        )
-
-
 def prepare_examination(
     blocks: xr.Dataset,
     baseline: xr.Dataset,
@@ -122,7 +87,7 @@ def prepare_examination(
     *,
     level: float = 0.005,
     seed: int = 0,
-    known: Sequence[Effect] = (),
+    model_effects: Sequence[Effect] = (),
     progress: Stage = no_stage,
     settings: Settings = DEFAULTS,
 ) -> Examination:
@@ -131,7 +96,7 @@ def prepare_examination(
     The null records come several at a time, with a leading dimension ``record``. With the
     probability `level`, noise alone gives an identification, or something unidentified. `seed` is
     that of the draws for statistics that the null records do not contain. The simulation contains
-    the `known` effects, but not the baseline; they are in the model before the selection begins.
+    the `model_effects`, but not the baseline; they are in the model before the selection begins.
     """
     folds = fold_blocks(blocks)
     effects, reasons = effect_candidates(blocks, baseline["coefficient"], settings=settings)
@@ -146,9 +111,9 @@ def prepare_examination(
             if has_coarse_grid(blocks).any()
             else "not identifiable: the quantization grid is that of angles, or too fine to show"
         )
-    threshold = fit_best_evidence(best, settings=settings).level(level)
+    threshold = fit_best_evidence(best, settings=settings).value_at(level)
     return Examination(
-        candidates, folds, count_evidence, threshold, start, tuple(known), best, reasons
+        candidates, folds, count_evidence, threshold, start, tuple(model_effects), best, reasons
     )
 
 

@@ -21,7 +21,7 @@ from gyrostab.diagnose.predict.sizes import component_mixture, component_size
 from gyrostab.diagnose.predict.windows import make_surrogates, max_correlation
 from gyrostab.diagnose.reduce.zero_bin import possibly_truncated_axes
 from gyrostab.diagnose.statistics.base import Competitor
-from gyrostab.diagnose.statistics.candidates import largest_size
+from gyrostab.diagnose.statistics.build_candidates import largest_size
 from gyrostab.physics.registry import effects
 
 #: Number of time shifts at most, the recorded time among them: ten make the allowed share of 5 %.

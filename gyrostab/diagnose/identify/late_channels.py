@@ -13,12 +13,13 @@ from scipy.special import ndtr, ndtri
 
 from gyrostab.arrays import Floats, Ints
 from gyrostab.diagnose.identify.components import sum_evidence
-from gyrostab.diagnose.identify.examination import Examination, Identifications
-from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.identify.examination import Examination
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.windows import channel_units
 from gyrostab.diagnose.reduce.log_blocks import channel_means, is_rms_channel
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.schema.delays import move_channels
 from gyrostab.time.grid import grid_times
 
@@ -54,7 +55,7 @@ def find_late_channel(
     examination, blocks = identifications.examination, identifications.state.blocks
     unexplained = [
         selection
-        for selection in (*identifications.identified, *identifications.unknown)
+        for selection in (*identifications.identified, *identifications.unidentified)
         if _may_follow_channel(selection)
     ]
     block_s = float(blocks.attrs["block_s"])

@@ -10,8 +10,8 @@ import numpy as np
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, keep_physical
-from gyrostab.diagnose.identify.identification import ambiguous_evidence, form_error, make_selection
-from gyrostab.diagnose.predict.candidates import Candidate, Component
+from gyrostab.diagnose.identify.selections import ambiguous_evidence, form_error, make_selection
+from gyrostab.diagnose.predict.candidates import Candidate, Component, is_nuisance
 from gyrostab.diagnose.predict.condition import condition_on, mean_columns
 from gyrostab.diagnose.predict.linear_model import State
 
@@ -22,7 +22,7 @@ def order_passing(
     state: State,
     examination: Examination,
 ) -> list[str]:
-    """Return the keys that pass, in the order in which they are to be named.
+    """Return the keys that are to be named next, in their order; all others wait.
 
     Anomalous samples come first, because they raise powers and means too, and not the other
     way round. Then motion that another sensor confirms, then a bias that switches within
@@ -33,7 +33,7 @@ def order_passing(
     counts = [
         key
         for key in passing
-        if components[key][0].candidate.statistic.is_count and not key.startswith("~")
+        if components[key][0].candidate.statistic.is_count and not is_nuisance(key)
     ]
     confirmed = [
         key
@@ -50,7 +50,7 @@ def order_passing(
         or switching
         or _on_other_axes(_without_slopes(passing, components, state, examination), components)
     )
-    return put_followers_first(first, components, state)
+    return drop_switching_with_a_cause(first, components, state)
 
 
 def _on_other_axes(passing: list[str], components: Mapping[str, Sequence[Component]]) -> list[str]:
@@ -59,9 +59,9 @@ def _on_other_axes(passing: list[str], components: Mapping[str, Sequence[Compone
     An axis that moves, for instance, has much that no effect explains. What another axis senses of
     it by its misalignment does not compete with that.
     """
-    if not passing or not passing[0].startswith("~"):
+    if not passing or not is_nuisance(passing[0]):
         return passing
-    alternatives = [key for key in passing if key.startswith("~")]
+    alternatives = [key for key in passing if is_nuisance(key)]
     first = []
     for key in passing:
         axes = {axis for component in components[key] for axis in component.row}
@@ -86,7 +86,7 @@ def order_rivals(
     rivals = [
         key
         for key in passing
-        if not key.startswith("~")
+        if not is_nuisance(key)
         and sum_evidence(components[key])
         >= ambiguous_evidence(components[key][:1], best, settings=settings)
     ]
@@ -151,7 +151,7 @@ def _confirmed_components(components: Sequence[Component], state: State) -> list
     ]
 
 
-def put_followers_first(
+def drop_switching_with_a_cause(
     passing: list[str], components: Mapping[str, Sequence[Component]], state: State
 ) -> list[str]:
     """Drop telegraph biases while a passing mean that follows a channel may be their cause.
@@ -160,7 +160,7 @@ def put_followers_first(
     leaves switches with it. Therefore the channel comes first where it explains more on the same
     axis, or half of the course of the switching.
     """
-    led = [
+    driven_means = [
         component
         for key in passing
         for component in components[key]
@@ -177,7 +177,7 @@ def put_followers_first(
                 or _explained_share(component, other, state) > state.settings.majority_share
             )
             for component in components[key]
-            for other in led
+            for other in driven_means
         )
     ]
 
@@ -214,7 +214,7 @@ def identify_switching(
     """
     return [
         key
-        for key in put_followers_first(passing, components, state)
+        for key in drop_switching_with_a_cause(passing, components, state)
         if any(
             component.variant.inside.size and not state.given.get(("sub_block", component.row[0]))
             for component in components[key]
@@ -245,19 +245,21 @@ def find_pair(
     keys = [
         key
         for key in passing
-        if not key.startswith("~")
+        if not is_nuisance(key)
         and (
             components[key][0].statistic is alternative[0].statistic
             or (is_in_means and components[key][0].statistic.is_linear_in_means)
         )
     ]
     companions = {
-        key: _find_beside(examination, keys, components[key], required[key], state) for key in keys
+        key: _find_companions(examination, keys, components[key], required[key], state)
+        for key in keys
     }
     totals = {
-        (first, second): sum_evidence(components[first]) + sum_evidence(components_beside[second])
-        for first, (_, components_beside) in companions.items()
-        for second in components_beside
+        (first, second): sum_evidence(components[first])
+        + sum_evidence(components_with_first[second])
+        for first, (_, components_with_first) in companions.items()
+        for second in components_with_first
     }
     pairs = {
         pair: min(totals[pair], totals[pair[::-1]])
@@ -270,17 +272,20 @@ def find_pair(
     if best is None or pairs[best] <= sum_evidence(alternative):
         return []
     first, second = best
-    with_second, beside_second = companions[second]
-    first_components = beside_second[first]
-    with_first, beside_first = _find_beside(
+    state_with_second, components_with_second = companions[second]
+    first_components = components_with_second[first]
+    state_with_first, components_with_first = _find_companions(
         examination, [second], first_components, required[first], state
     )
-    if second not in beside_first:
+    if second not in components_with_first:
         return []
-    return [(first, first_components, with_second), (second, beside_first[second], with_first)]
+    return [
+        (first, first_components, state_with_second),
+        (second, components_with_first[second], state_with_first),
+    ]
 
 
-def _find_beside(
+def _find_companions(
     examination: Examination,
     keys: Sequence[str],
     components: list[Component],
@@ -291,10 +296,10 @@ def _find_beside(
     chosen = [make_selection(components, required)]
     with_first = condition_on(state, components)
     sought = [candidate for candidate in examination.candidates if candidate.key in keys]
-    components_beside = {}
+    companions = {}
     for key, effect_components in examination.find_components(sought, with_first).items():
         error = form_error(effect_components, chosen, settings=examination.settings)
         physical, _ = keep_physical(effect_components, with_first, error=error)
         if sum_evidence(physical) > examination.threshold + error:
-            components_beside[key] = physical
-    return with_first, components_beside
+            companions[key] = physical
+    return with_first, companions

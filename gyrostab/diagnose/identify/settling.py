@@ -19,13 +19,13 @@ from gyrostab.diagnose.identify.identifiability import (
     find_spectral_alternatives,
     keep_physical,
 )
-from gyrostab.diagnose.identify.identification import (
+from gyrostab.diagnose.identify.selections import (
     Selection,
     ambiguous_evidence,
     components_of,
     with_axes_of,
 )
-from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.candidates import Component, is_nuisance
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 
@@ -55,7 +55,10 @@ def prune_selections(examination: Examination, chosen: list[Selection]) -> list[
 def settle_selections(
     examination: Examination, chosen: list[Selection]
 ) -> tuple[list[Selection], list[Selection]]:
-    """Finish the identifications, and drop the weakest until all reach their threshold."""
+    """Finish the identifications, and drop the weakest until all reach their threshold.
+
+    Returns what is unidentified, and the finished identifications.
+    """
     while True:
         identified = {
             place: _finish_identification(examination, selection, chosen)
@@ -70,7 +73,8 @@ def settle_selections(
             margin[place] = identification.evidence_nats - max(identification.threshold, required)
         weakest = min(margin, key=lambda place: margin[place], default=None)
         if weakest is None or margin[weakest] >= 0.0:
-            return chosen, list(identified.values())
+            unidentified = [selection for selection in chosen if not selection.is_named]
+            return unidentified, list(identified.values())
         chosen = [*chosen[:weakest], *chosen[weakest + 1 :]]
 
 
@@ -93,25 +97,25 @@ def _finish_identification(
         for other, components in on_axes.items()
         if components
         and other != key
-        and not other.startswith("~")
+        and not is_nuisance(other)
         and sum_evidence(components) >= min_nats
         and sum_evidence(keep_physical(components, state)[0]) >= min_nats
     ]
     lines = {
-        component.place
+        component.line_index
         for component in components_of(chosen)
         if component.candidate.effect == PLAIN_LINE
     }
     rivals += find_equivalent_effects(
         identification.effect, identification.components, state, lines=len(lines)
     )
-    of_any_spectrum = find_spectral_alternatives(
+    spectral_alternatives = find_spectral_alternatives(
         identification.effect,
         [component for layer in layers for component in layer],
         weighted,
         examination,
     )
-    rivals += of_any_spectrum
+    rivals += spectral_alternatives
     alternatives = dict.fromkeys([*identification.alternatives, *rivals])
     alternatives.pop(identification.effect, None)
     components = tuple(
@@ -127,7 +131,7 @@ def _finish_identification(
         alternatives=tuple(alternatives),
         components=components,
         # as probable as this effect, whatever their own form explains
-        instead=sum_by_key(on_axes) | dict.fromkeys(of_any_spectrum, evidence_nats),
+        instead=sum_by_key(on_axes) | dict.fromkeys(spectral_alternatives, evidence_nats),
     )
 
 
@@ -139,7 +143,9 @@ def find_instead(
     They are in its statistics and on its axes. `state` has all others in the model; it is returned
     with the weights that it has with the selection.
     """
-    weighted = replace(state, weight=condition_on(state, list(selection.components)).weight)
+    weighted = replace(
+        state, expected_power=condition_on(state, list(selection.components)).expected_power
+    )
     statistics = {component.statistic for component in selection.components}
     candidates = [
         candidate for candidate in examination.candidates if candidate.statistic in statistics
@@ -172,10 +178,10 @@ def _find_layers_again(
     jumps explains little alone. `first` was found with none of the identification in the model.
     """
     out = [list(first)]
-    weight, key = state.weight, components[0].candidate.key
+    expected_power, key = state.expected_power, components[0].candidate.key
     axes = {axis for component in components for axis in component.row}
     for previous_layer, layer in pairwise(split_layers(components)):
-        state = replace(condition_on(state, previous_layer), weight=weight)
+        state = replace(condition_on(state, previous_layer), expected_power=expected_power)
         layer_components = examination.find_components(candidates_of(layer), state).get(key, [])
         out.append([component for component in layer_components if set(component.row) & axes])
     return out

@@ -13,7 +13,7 @@ from gyrostab.diagnose.evidence.mixture import products_mixture
 from gyrostab.diagnose.evidence.products import mean_products
 from gyrostab.diagnose.identify.components import split_layers, sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
-from gyrostab.diagnose.identify.identification import (
+from gyrostab.diagnose.identify.selections import (
     Selection,
     components_of,
     make_selection,
@@ -78,9 +78,7 @@ def withdraw_effects(
         ]
         if not on_axis:
             continue
-        excess_nats = variance_fluctuation(
-            examination.state_with([*remaining, *unidentified]), axis
-        )
+        excess_nats = measure_fluctuation(examination.state_with([*remaining, *unidentified]), axis)
         weak = _find_weak(examination, on_axis, axis, excess_nats)
         if weak:
             remaining = [
@@ -168,7 +166,7 @@ def _evidence_on(selection: Selection, axis: str) -> float:
     )
 
 
-def variance_fluctuation(state: State, axis: str) -> float:
+def measure_fluctuation(state: State, axis: str) -> float:
     """Return the evidence [nats] of a power level that wanders over one that is constant.
 
     The level is that of all bands of a block together, relative to the expected one with all
@@ -207,14 +205,14 @@ def _power_levels(state: State, row: int, axis: str) -> tuple[Floats, Floats, Fl
     The level is relative to the expected one, less 1.
     """
     shape = axis_values(state.baseline, "shape_alone", axis)
-    ratio = state.blocks["power"].values[row] / state.weight[row] - 1.0
+    ratio = state.blocks["power"].values[row] / state.expected_power[row] - 1.0
     use = np.where(np.isfinite(shape) & np.isfinite(ratio), shape, 0.0)
     total = use.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         level = (use * np.nan_to_num(ratio)).sum(axis=1) / total
         variance = 1.0 / total + axis_values(state.baseline, "common", axis)
         named = [
-            (use * column / state.weight[row]).sum(axis=1) / total
+            (use * column / state.expected_power[row]).sum(axis=1) / total
             for column in state.power_columns(axis)
         ]
     columns = np.nan_to_num(np.stack(named, axis=-1)) if named else np.empty((total.size, 0))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,16 +11,14 @@ from gyrostab.arrays import Floats, Ints
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS, Statistic, find_statistic
+from gyrostab.diagnose.statistics.base import Region
 from gyrostab.diagnose.statistics.mean import region_mean
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 
-#: Fields of a place where recording and simulation differ: ``statistic``, ``view``, ``axes``
-#: (separated by blanks), ``what``, ``begin``, ``end`` [s since the start], ``tau_min_s``,
-#: ``tau_max_s`` [s], ``frequency`` [Hz], ``sign`` (0 for a mean that wanders), ``z``, ``ratio``
-#: (observed over expected; for means and restarts the number of standard deviations), ``estimate``
-#: (depends on the statistic), ``p_value``.
-Region = dict[str, Any]
-TAU_TOLERANCE = 0.99  # ratio of averaging times that are equal but for rounding
+#: Ratios of averaging times that are equal but for rounding.
+MIN_TAU_RATIO, MAX_TAU_RATIO = 0.99, 1.01
+#: On either side of a window, in which the time of its region is sought [lengths of the window].
+_REACH_WINDOWS = 3
 _SEPARATE_KINDS = ("slow", "variance", "drifting")
 # Limits of the table; the rows left out are the least certain.
 MAX_PER_ROW = 8  # mismatches of one statistic and row
@@ -69,7 +66,7 @@ def _locate_regions(
     z = standardise(first, null.statistics[statistic.name])
     regions = []
     for row in range(z.shape[0]):
-        now, scores, row_z = baseline, first, z[row]
+        remaining_baseline, scores, row_z = baseline, first, z[row]
         remaining = row_z.copy()
         for _ in range(MAX_PER_ROW):
             region = _take_region(statistic, scores, row, remaining, row_z, null, level)
@@ -77,8 +74,8 @@ def _locate_regions(
                 break
             regions.append(region)
             if statistic.is_linear_in_means:
-                now = _without_region(region, blocks, now, row)
-                rescored = statistic.score(blocks, now)
+                remaining_baseline = _without_region(region, blocks, remaining_baseline, row)
+                rescored = statistic.score(blocks, remaining_baseline)
                 if rescored is None:
                     break
                 scores = rescored
@@ -130,11 +127,11 @@ def _take_region(
     if np.isfinite(combined[column]):
         largest = max(largest, combined[column])
     columns, reach = _find_columns(statistic, scores, combined, ratio, int(column), null.settings)
-    region = {
+    region: Region = {
         "statistic": statistic.name,
         "view": statistic.view,
         "axes": str(scores["axes"].values[row]),
-        "what": str(scores["what"].values[column]),
+        "quantity": str(scores["quantity"].values[column]),
         "begin": begin,
         "end": end,
         "tau_min_s": float(scores["tau_min_s"].values[columns].min()),
@@ -166,7 +163,7 @@ def _find_span(
     first, stop = scores["first"].values, scores["stop"].values
     begin, end = scores["begin"].values, scores["end"].values
     fine = _disjoint_windows(first, stop, np.flatnonzero(np.isfinite(z)))
-    reach = 3 * (stop[window] - first[window])
+    reach = _REACH_WINDOWS * (stop[window] - first[window])
     fine = fine[(stop[fine] > first[window] - reach) & (first[fine] < stop[window] + reach)]
     total = np.concatenate([[0.0], np.cumsum(z[fine])])
     best, low, high = -np.inf, 0, fine.size
@@ -234,7 +231,7 @@ def _find_columns(
     settings: Settings,
 ) -> tuple[Ints, Ints]:
     """Return the columns of a region, and those that it explains."""
-    kinds, low, high = (scores[name].values for name in ("what", "tau_min_s", "tau_max_s"))
+    kinds, low, high = (scores[name].values for name in ("quantity", "tau_min_s", "tau_max_s"))
     above = np.nan_to_num(combined) > settings.clear_sigma
     if kinds[column] == "level":  # of all averaging times: the region has those above the noise
         avar_columns = np.flatnonzero(above & (kinds == "avar"))
@@ -250,7 +247,9 @@ def _find_columns(
     if kinds[column] == "line":
         first, last = max(lower - LEAK_LINES, 0), min(upper + LEAK_LINES + 1, kinds.size)
         return np.array([column]), np.arange(first, last)
-    overlap = (low <= high[grown].max() * 1.01) & (high >= low[grown].min() * 0.99)
+    overlap = (low <= high[grown].max() * MAX_TAU_RATIO) & (
+        high >= low[grown].min() * MIN_TAU_RATIO
+    )
     return region, np.flatnonzero(overlap)
 
 
@@ -262,7 +261,7 @@ def merge_regions(regions: Sequence[Region], *, settings: Settings = DEFAULTS) -
 
     Examples
     --------
-    >>> region = {"statistic": "power", "view": "davar", "axes": "x", "what": "avar",
+    >>> region = {"statistic": "power", "view": "davar", "axes": "x", "quantity": "avar",
     ...           "begin": 0.0, "end": 60.0, "tau_min_s": 0.01, "tau_max_s": 0.1,
     ...           "frequency": float("nan"), "sign": 1, "z": 9.0, "p_value": 1e-6}
     >>> on_y = region | {"axes": "y", "z": 8.0}
@@ -281,7 +280,7 @@ def merge_regions(regions: Sequence[Region], *, settings: Settings = DEFAULTS) -
                 _extend_region(other, region, settings)
                 break
         else:
-            merged.append(dict(region))
+            merged.append(region.copy())
     return merged
 
 
@@ -291,22 +290,22 @@ def _are_alike(region: Region, other: Region, settings: Settings) -> bool:
         region["sign"] != other["sign"] and region["view"] != "cross_axis"
     ):
         return False
-    if region["what"] == "line" or other["what"] == "line":
+    if region["quantity"] == "line" or other["quantity"] == "line":
         return bool(
-            region["what"] == other["what"]
+            region["quantity"] == other["quantity"]
             and abs(region["frequency"] / other["frequency"] - 1.0) < settings.line_width_share
         )
     if _kind_of(region) != _kind_of(other):
         return False
     return bool(
         min(region["tau_max_s"], other["tau_max_s"])
-        >= TAU_TOLERANCE * max(region["tau_min_s"], other["tau_min_s"])
+        >= MIN_TAU_RATIO * max(region["tau_min_s"], other["tau_min_s"])
     )
 
 
 def _kind_of(region: Region) -> str:
     """Return the kind of a region; regions of different kinds are not merged."""
-    kind = str(region["what"]).split(" ")[0]
+    kind = region["quantity"].split(" ")[0]
     return kind if kind in _SEPARATE_KINDS else ""
 
 
@@ -336,7 +335,7 @@ def _extend_region(region: Region, other: Region, settings: Settings) -> None:
             min(region["begin"], other["begin"]),
             max(region["end"], other["end"]),
         )
-        if region["what"] != "line":
+        if region["quantity"] != "line":
             low = min(region["tau_min_s"], other["tau_min_s"])
             high = max(region["tau_max_s"], other["tau_max_s"])
             region["tau_min_s"], region["tau_max_s"] = low, high

@@ -20,7 +20,7 @@ from gyrostab.diagnose.evidence.sample_counts import kurtosis_moments
 from gyrostab.diagnose.evidence.spectral_lines import interpolate_bands
 from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.predict.linear_model import unspread_share
-from gyrostab.diagnose.reduce.block_statistics import pair_indices
+from gyrostab.diagnose.reduce.schema import pair_indices
 from gyrostab.diagnose.statistics import STATISTICS
 from gyrostab.diagnose.statistics.base import NullDraw
 from gyrostab.diagnose.statistics.cross_spectrum import draw_coherency
@@ -45,6 +45,8 @@ _KURTOSIS_SAMPLES = 10**6  # simulated sample by sample; limits time
 _MAX_BANDS_APART = 4  # of bands that the taper correlates
 _MIN_BAND_CORRELATION = 0.003  # smaller ones are neglected
 _MAX_COMMON_SHARE = 0.9  # of the scatter of a band that may be common with others
+# Least power of a band without its lines, over that with them. Design choice.
+_MIN_SHARE_WITHOUT_LINES = 0.01
 _MIN_EIGENVALUE = 1e-9  # of a coherence: with gaps it may be negative for nearly equal axes
 
 
@@ -65,13 +67,14 @@ class _NullSetup(NamedTuple):
 
     blocks: xr.Dataset
     baseline: xr.Dataset
-    # Shapes of the gamma parts that each band has in common with the first, second, ... above it.
+    #: Shapes of the gamma parts that each band has in common with the first, second, ... above it.
     ties: list[Floats]
-    effects: Floats  # expected power divided by that of the noise alone
-    sd: Floats  # standard deviations of a sample and of a difference of neighbours, by axis
-    # Excess kurtosis of a block beyond that of white Gaussian noise, and the ratio of its scatter
-    # to that of white Gaussian noise, by axis.
-    tails: Floats
+    effect_ratio: Floats  # expected power divided by that of the noise alone
+    #: (axis, 2): standard deviations of a sample and of a difference of neighbours.
+    sample_sd: Floats
+    #: (axis, 1): excess kurtosis of a block, minus that of white Gaussian noise.
+    kurtosis_shift: Floats
+    kurtosis_scatter: Floats  # (axis, 1): its scatter, divided by that of white noise
     shared: _SharedNoise | None  # noise common to axes
 
 
@@ -127,23 +130,32 @@ def _prepare_nulls(
     blocks: xr.Dataset, baseline: xr.Dataset, rng: np.random.Generator
 ) -> _NullSetup:
     noise = sum_noise(baseline["columns"].values, baseline["square"].values)
-    effects = baseline["spectrum"].values / noise
+    effect_ratio = baseline["spectrum"].values / noise
     lines = line_columns(blocks)
     rate = float(blocks.attrs["sampling_rate_hz"])
     half_difference = 1.0 - np.cos(2.0 * np.pi * blocks["line_frequency"].values / rate)
-    sd = []
+    sample_sd = []
     density = lines * baseline["square"].values[:, None]  # (axis, line, term)
     if "line_noise" in baseline:  # a filter leaves no rounding apart
         density = np.stack([np.zeros(density.shape[:2]), baseline["line_noise"].values], axis=-1)
     for total in density.sum(axis=-1):
         variances = total.mean() * rate, 2.0 * ((total * half_difference).mean() * rate)
-        sd.append(np.sqrt(variances))
-    if "peaks" in baseline:
-        density = np.concatenate([density, baseline["peaks"].values[..., None]], axis=-1)
-    tails = np.array([_kurtosis_excess(blocks, axis_density, rng) for axis_density in density])
+        sample_sd.append(np.sqrt(variances))
+    if "broad_peaks" in baseline:
+        density = np.concatenate([density, baseline["broad_peaks"].values[..., None]], axis=-1)
+    kurtosis = np.array([_kurtosis_excess(blocks, axis_density, rng) for axis_density in density])
     ties = _common_shapes(baseline["shape_alone"].values, int(blocks.attrs["block_samples"]))
     shared = _find_shared_noise(blocks, baseline)
-    return _NullSetup(blocks, baseline, ties, effects, np.array(sd), tails, shared)
+    return _NullSetup(
+        blocks,
+        baseline,
+        ties,
+        effect_ratio,
+        np.array(sample_sd),
+        kurtosis_shift=kurtosis[:, :1],
+        kurtosis_scatter=kurtosis[:, 1:],
+        shared=shared,
+    )
 
 
 def _common_shapes(shape: Floats, size: int) -> list[Floats]:
@@ -204,32 +216,33 @@ def _kurtosis_excess(
 
 
 def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr.Dataset:
+    """Draw `count` null records together; the record is the first dimension."""
     blocks, baseline = setup.blocks, setup.baseline
     axes, draws = blocks.sizes["axis"], baseline.sizes["draw"]
     chosen = rng.integers(0, draws, (count, axes))
     squares, slow = (
         baseline[name].values[np.arange(axes), chosen] for name in ("posterior", "posterior_slow")
     )
-    expected = np.einsum("abfn,ran->rabf", baseline["columns"].values, squares) * setup.effects
+    expected = np.einsum("abfn,ran->rabf", baseline["columns"].values, squares) * setup.effect_ratio
     if "form_shape" in baseline:  # the form of the spectrum was measured on a simulated log
         form = baseline["form_shape"].values
         expected *= _draw_gamma(form, np.ones((count, *form.shape)), rng)[:, :, None]
-    between: Complexes | None = None
+    coherency: Complexes | None = None
     if setup.shared is None:
         power = _draw_gamma(baseline["shape_alone"].values, expected, rng, setup.ties)
     else:
-        power, between = _draw_shared_spectra(setup.shared, count, rng)
+        power, coherency = _draw_shared_spectra(setup.shared, count, rng)
         power *= expected
         if "cross_error" in baseline:
             error = baseline["cross_error"].values
-            between += (
+            coherency += (
                 error * (rng.standard_normal((count, *error.shape, 2)) @ np.array([1.0, 1j]))
             )[:, :, None]
     common = baseline["common"].values
-    swell_shape = np.full(common.shape, np.inf)
-    np.divide(1.0, common, out=swell_shape, where=common > 0.0)
-    swell = _draw_gamma(swell_shape, np.ones(power.shape[:3]), rng)[..., None]
-    power *= swell
+    common_shape = np.full(common.shape, np.inf)
+    np.divide(1.0, common, out=common_shape, where=common > 0.0)
+    common_factor = _draw_gamma(common_shape, np.ones(power.shape[:3]), rng)[..., None]
+    power *= common_factor
     power[..., np.isnan(blocks["power"].values)] = np.nan
     variables: dict[str, Any] = {
         "mean": (("axis", "block"), _draw_means(setup, squares, slow, rng)),
@@ -238,10 +251,12 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
         "kurtosis": (("axis", "block"), _draw_kurtosis(setup, count, rng)),
         "cross": (
             ("pair", "block", "band"),
-            _draw_cross(setup, power if between is None else expected * swell, between, rng),
+            _draw_cross(
+                setup, power if coherency is None else expected * common_factor, coherency, rng
+            ),
         ),
     }
-    draw = NullDraw(blocks, baseline, count, rng, expected, power, setup.sd)
+    draw = NullDraw(blocks, baseline, count, rng, expected, power, setup.sample_sd)
     variables |= {
         name: (tuple(map(str, blocks[name].dims)), values)
         for statistic in STATISTICS
@@ -340,17 +355,18 @@ def _draw_lines(setup: _NullSetup, squares: Floats, rng: np.random.Generator) ->
         if not (chosen.any() and weight[axis, part] > 0.0):
             continue
         share = unspread[axis, chosen].mean()
-        over = setup.effects[axis, chosen].mean(axis=0)
+        over = setup.effect_ratio[axis, chosen].mean(axis=0)
         if "line_spectrum" in baseline:
             columns = baseline["columns"].values[axis, chosen]
             noise = (columns @ baseline["square"].values[axis]).mean(axis=0)
-            over = np.maximum(over - baseline["line_spectrum"].values[axis] / noise, 0.01 * over)
+            without_lines = over - baseline["line_spectrum"].values[axis] / noise
+            over = np.maximum(without_lines, _MIN_SHARE_WITHOUT_LINES * over)
         effects = interpolate_bands(over[None], frequency, bands)[0]
         if "line_shape" in baseline:
             effects = effects * baseline["line_shape"].values[axis]
         out[:, axis, part] = (share * plain[:, axis] + (1.0 - share) * flat[:, axis]) * effects
-        if "peaks" in baseline:
-            out[:, axis, part] += baseline["peaks"].values[axis]
+        if "broad_peaks" in baseline:
+            out[:, axis, part] += baseline["broad_peaks"].values[axis]
     for record in out:  # one after the other: they may have many lines
         drawn = _draw_gamma(weight[..., None], np.ones(record.shape), rng)
         record *= _correlate_lines(drawn, int(blocks.attrs["block_samples"]))
@@ -368,14 +384,14 @@ def _correlate_lines(drawn: Floats, size: int) -> Floats:
 
 
 def _draw_cross(
-    setup: _NullSetup, level: Floats, between: Complexes | None, rng: np.random.Generator
+    setup: _NullSetup, level: Floats, coherency: Complexes | None, rng: np.random.Generator
 ) -> Complexes:
     """Return cross-spectra from those relative to both levels; independent ones if None."""
     first, second = pair_indices(setup.blocks)
     size = np.sqrt(level[:, first] * level[:, second])
-    if between is None:
-        between = draw_coherency(setup.blocks["cross_shape"].values, size.shape, rng)
-    return np.asarray(size * between)
+    if coherency is None:
+        coherency = draw_coherency(setup.blocks["cross_shape"].values, size.shape, rng)
+    return np.asarray(size * coherency)
 
 
 def _widen_tails(score: Floats, n: Floats) -> Floats:
@@ -400,10 +416,10 @@ def _draw_kurtosis(setup: _NullSetup, count: int, rng: np.random.Generator) -> F
     noise = _widen_tails(rng.standard_normal((count, *recorded.shape)), samples)
     root = 1.0 - 2.0 / (9.0 * a) - noise * np.sqrt(2.0 / (9.0 * a))
     score = ((1.0 - 2.0 / a) / np.maximum(root, 0.1) ** 3 - 1.0) / np.sqrt(2.0 / (a - 4.0))
-    out = mean + setup.tails[:, :1] + np.sqrt(variance) * setup.tails[:, 1:] * score
+    out = mean + setup.kurtosis_shift + np.sqrt(variance) * setup.kurtosis_scatter * score
     for axis, step in enumerate(blocks["quantization_step"].values):
         good = recorded[axis][np.isfinite(recorded[axis])]
-        if step > COARSE_STEP_SIGMA * setup.sd[axis, 0] and good.size:
+        if step > COARSE_STEP_SIGMA * setup.sample_sd[axis, 0] and good.size:
             out[:, axis] = rng.choice(good, out[:, axis].shape)
     return np.asarray(out)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +29,7 @@ class MaximumDistribution:
     sample: Floats
     start: float
     scale: float
-    share: float
+    tail_share: float  # probability of the tail
 
     def surprise(self, value: Floats | float) -> Floats:
         """Return ``-log`` of the probability that a null record's largest is at least `value`."""
@@ -37,19 +37,19 @@ class MaximumDistribution:
         rank = (self.sample.size - np.searchsorted(self.sample, value) + 1.0) / (
             self.sample.size + 1.0
         )
-        beyond = (value - self.start) / self.scale - np.log(self.share)
+        beyond = (value - self.start) / self.scale - np.log(self.tail_share)
         return np.asarray(
-            np.where(value > self.start, beyond, -np.log(np.clip(rank, self.share, 1.0)))
+            np.where(value > self.start, beyond, -np.log(np.clip(rank, self.tail_share, 1.0)))
         )
 
     def probability(self, value: Floats | float) -> Floats:
         """Return the probability that a null record's largest is at least `value`."""
         return np.asarray(np.clip(np.exp(-self.surprise(value)), MIN_P_VALUE, 1.0))
 
-    def level(self, p: float) -> float:
+    def value_at(self, p: float) -> float:
         """Return the value that the largest of a null record reaches with probability `p`."""
-        if p < self.share:
-            return float(self.start + self.scale * np.log(self.share / p))
+        if p < self.tail_share:
+            return float(self.start + self.scale * np.log(self.tail_share / p))
         return float(np.quantile(self.sample, 1.0 - p))
 
 
@@ -79,7 +79,7 @@ class NullScores:
 
     def critical(self, statistic: str, level: float) -> float:
         """Return the standardised score of a statistic at which the p-value is `level`."""
-        t = self.statistics[statistic].tail.level(float(np.exp(-self.family.level(level))))
+        t = self.statistics[statistic].tail.value_at(float(np.exp(-self.family.value_at(level))))
         return float(np.sqrt(2.0 * max(t, 0.0)))
 
 
@@ -88,17 +88,10 @@ def null_scores(
 ) -> NullScores:
     """Collect the scores of null records chunk by chunk, keeping only extreme scores."""
     gathered: dict[str, _ScoreSums] = {}
-    for chunk in nulls:
-        powers = max(chunk["power"].size, chunk["line_power"].size) // chunk.sizes["record"]
-        size = max(_MIN_RECORDS_AT_ONCE, _POWERS_AT_ONCE // powers)
-        for first in range(0, chunk.sizes["record"], size):
-            part = chunk.isel(record=slice(first, first + size))
-            for statistic in STATISTICS:
-                scores = statistic.score(part, baseline)
-                if scores is not None:
-                    if statistic.name not in gathered:
-                        gathered[statistic.name] = _ScoreSums(scores, settings.pooled_records)
-                    gathered[statistic.name].add(scores)
+    for name, scores in _score_parts(nulls, baseline):
+        if name not in gathered:
+            gathered[name] = _ScoreSums(scores, settings.pooled_records)
+        gathered[name].add(scores)
     statistics = {}
     largest = {}
     for name, sums in gathered.items():
@@ -114,6 +107,21 @@ def null_scores(
     return NullScores(statistics, family, settings)
 
 
+def _score_parts(
+    nulls: Iterable[xr.Dataset], baseline: xr.Dataset
+) -> Iterator[tuple[str, xr.Dataset]]:
+    """Yield the name of each statistic with its scores of some null records, for all records."""
+    for chunk in nulls:
+        powers = max(chunk["power"].size, chunk["line_power"].size) // chunk.sizes["record"]
+        size = max(_MIN_RECORDS_AT_ONCE, _POWERS_AT_ONCE // powers)
+        for first in range(0, chunk.sizes["record"], size):
+            part = chunk.isel(record=slice(first, first + size))
+            for statistic in STATISTICS:
+                scores = statistic.score(part, baseline)
+                if scores is not None:
+                    yield statistic.name, scores
+
+
 def standardise(scores: xr.Dataset, null: StatisticNull) -> Floats:
     """Return scores in standard deviations of the null records, at least 0 if one-sided."""
     z = (scores["z"].values - null.mean) / null.spread
@@ -126,7 +134,7 @@ def fit_best_evidence(best: Floats, *, settings: Settings = DEFAULTS) -> Maximum
     Examples
     --------
     >>> best = fit_best_evidence(np.random.default_rng(1).exponential(size=100_000))
-    >>> abs(best.level(0.001) - np.log(1000)) < 0.1, abs(best.probability(5.0) - 0.007) < 0.001
+    >>> abs(best.value_at(0.001) - np.log(1000)) < 0.1, abs(best.probability(5.0) - 0.007) < 0.001
     (np.True_, np.True_)
     """
     return _fit_maximum(best, settings.tail_share, _MIN_EVIDENCE_SCALE)

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from gyrostab.noise import NORMAL_95
 from gyrostab.physics.registry import effects
 from gyrostab.units import HOUR
 
+#: Value and standard error of a parameter, and the ends of its 95 % interval if it is asymmetric.
+Size = tuple[float, ...]
 MAX_ZERO_LAG_S = 1e-2  # a lag that counts as zero
 #: Probability beyond the values that a grid supports. Design choice: a tenth of the tail of a 95 %
 #: interval, so that the interval of a single normal law stays as it is.
@@ -41,9 +44,26 @@ MAX_ADDED_POINTS = 40  # between the points of the grid
 MAX_RATIO = 100.0  # of two neighbours, above which the smaller one counts as zero
 
 
+class AveragedSizes(NamedTuple):
+    """Sizes of a component, averaged over the noise and the nuisance parameters."""
+
+    mean: Floats  # (column,)
+    covariance: Floats  # (column, column)
+    #: (2, column): ends of the 95 % intervals, those of a normal law, but not beyond the values
+    #: that the grid supports. Sizes at neighbours on a coarse grid may differ by many standard
+    #: errors, and the scatter of the mean then reaches zero although none of them does.
+    ends: Floats
+    #: Nuisance parameters; NaN as the standard error of one that is set but not measured.
+    nuisance: dict[str, Size]
+    #: Sizes at the likeliest point of the grid, and that point. These values belong together; sizes
+    #: at some value of a nuisance parameter may be far from the effect with both averages.
+    likeliest_sizes: Floats
+    likeliest_variant: Variant
+
+
 def average_sizes(
     component: Component, state: State, candidates: Sequence[Candidate]
-) -> tuple[Floats, Floats, Floats, dict[str, tuple[float, ...]], tuple[Floats, Variant]]:
+) -> AveragedSizes:
     """Return the sizes of a component, averaged over the noise and the nuisance parameters.
 
     Exponents have their defaults and lags are zero unless other values are better by 3 nats and an
@@ -51,20 +71,6 @@ def average_sizes(
     the lag is given as zero. Exponents are not averaged over, because each gives the size another
     unit. The state has all other effects in the model, and the candidates are all that were tried;
     they have the grid.
-
-    Returns
-    -------
-    mean, covariance : ndarray, shape (column,) and (column, column)
-    ends : ndarray, shape (2, column)
-        Ends of the 95 % intervals: those of a normal law, but not beyond the values that the grid
-        supports. Sizes at neighbours on a coarse grid may differ by many standard errors, and the
-        scatter of the mean then reaches zero although none of them does.
-    nuisance : dict of str to (float, float) or (float, float, float, float)
-        Value and standard deviation of the nuisance parameters, with the ends of the 95 % interval
-        if it is asymmetric; NaN as the standard deviation of one that is set but not measured.
-    likeliest : (ndarray, Variant)
-        Sizes at the likeliest point of the grid, and that point. These values belong together;
-        sizes at some value of a nuisance parameter may be far from the effect with both averages.
     """
     points = refine_grid(component, state, choose_grid(component, state, candidates))
     family = [point.variant for point in points]
@@ -89,7 +95,17 @@ def average_sizes(
     ends = _size_interval(mean, covariance, supported)
     weighed = evidence + np.log([point.share for point in points])
     share = np.exp(weighed - np.logaddexp.reduce(weighed))
-    nuisance: dict[str, tuple[float, ...]] = {}
+    nuisance = _average_nuisance(family, share, has_no_lag=bool(without_lag))
+    at_best = max(without_lag or range(len(points)), key=lambda place: evidence[place])
+    best, _ = points[at_best].sizes.moments()
+    return AveragedSizes(mean, covariance, ends, nuisance, best, family[at_best])
+
+
+def _average_nuisance(
+    family: Sequence[Variant], share: Floats, *, has_no_lag: bool
+) -> dict[str, Size]:
+    """Average the nuisance parameters of variants with these probabilities (variant,)."""
+    nuisance: dict[str, Size] = {}
     names = (
         key
         for variant in family
@@ -103,20 +119,14 @@ def average_sizes(
         if np.ptp(tried) == 0.0:
             nuisance[name] = (float(tried[0]), math.nan)
             continue
-        has_no_lag = bool(without_lag) and _is_lag(name)
-        middle_of = 0.0 if has_no_lag else float(share @ tried)
-        spread = max(
-            math.sqrt(float(share @ (tried - middle_of) ** 2)),
-            0.3 * _grid_spacing(tried, middle_of),
+        is_zero = has_no_lag and _is_lag(name)
+        value = 0.0 if is_zero else float(share @ tried)
+        stderr = max(
+            math.sqrt(float(share @ (tried - value) ** 2)), 0.3 * _grid_spacing(tried, value)
         )
-        nuisance[name] = (
-            (middle_of, spread)
-            if has_no_lag
-            else (middle_of, spread, *_interval_ends(tried, share, middle_of))
-        )
-    at_best = max(without_lag or range(len(points)), key=lambda place: evidence[place])
-    best, _ = points[at_best].sizes.moments()
-    return mean, covariance, ends, nuisance, (best, family[at_best])
+        ends = () if is_zero else _interval_ends(tried, share, value)
+        nuisance[name] = (value, stderr, *ends)
+    return nuisance
 
 
 def choose_grid(component: Component, state: State, candidates: Sequence[Candidate]) -> list[Point]:
@@ -288,7 +298,7 @@ def refine_grid(component: Component, state: State, points: Sequence[Point]) -> 
     grid = _Grid(component, state, *scale, points)
     for line in grid.lines:
         for down in (True, False) if len(line) > 1 else ():
-            grid.extend_line(line, down)
+            grid.extend_line(line, down=down)
     for _ in range(MAX_ROUNDS):
         if not grid.halve_steps(max(MAX_ADDED_POINTS - len(grid.points) + len(points), 0)):
             break
@@ -363,7 +373,7 @@ class _Grid:
             added.append(self._add_point(line, left, middle, 0.5 * (left.place + right.place)))
         return any(point is not None for point in added)
 
-    def extend_line(self, line: list[Point], down: bool) -> None:
+    def extend_line(self, line: list[Point], *, down: bool) -> None:
         """Add points beyond an end of a line, in steps like the last one.
 
         They continue while the likelihood rises and is within `LIKELY_NATS` of the largest. A lag

@@ -35,6 +35,23 @@ def content_digest(*items: Array | bytes | None) -> bytes:
 
 #: Nuisance parameter that is a time.
 TIME_PARAMETER = "at"
+#: Nuisance alternative -> description, in the order in which they are tried. Their names begin with
+#: "~", those of effects do not.
+NUISANCE_ALTERNATIVES = {
+    "~bias(t)": "the bias wanders",
+    "~levels": "the bias steps between several levels",
+    "~N(t)": "the noise level changes",
+    "~burst": "the noise level is higher for a while",
+    "~S(f)": "the spectrum has another shape",
+    "~outliers": "the distribution has heavy tails",
+    "~cov": "the axes have noise in common",
+    "~red": "the bias wanders far beyond its noise",
+}
+
+
+def is_nuisance(name: str) -> bool:
+    """Return whether a name, or the key of a candidate, is that of a nuisance alternative."""
+    return name.startswith("~")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +97,7 @@ class Prospect(NamedTuple):
 class Candidate:
     """An effect in one statistic."""
 
-    effect: str  # name in the registry; that of a nuisance alternative begins with "~"
+    effect: str  # name in the registry, or one of `NUISANCE_ALTERNATIVES`
     statistic: Statistic  # one of `gyrostab.diagnose.statistics.STATISTICS`
     #: Channels of the log that it follows, in the order of the effect's channels; an empty string
     #: for a missing one.
@@ -127,7 +144,7 @@ class Component:
     variant: Variant
     row: tuple[str, ...]  # axes of the row
     evidence_nats: float  # held-out evidence [nats]
-    place: int = -1  # index of the line, or of the set of harmonics; -1 if there is none
+    line_index: int = -1  # of the line, or of the set of harmonics; -1 if there is none
     note: str = ""  # sentence about terms that the record does not separate
     close: tuple[Variant, ...] = ()  # variants that explain the row about as well, the best first
 
@@ -160,8 +177,8 @@ class CandidateEvidence:
     rows: list[tuple[str, ...]]  # axes of each row
     evidence_nats: Array  # (record, row): held-out evidence [nats]
     best: tuple[Variant, ...]  # best variant of each row for the first record
-    #: (record, row): index of the line for lines; otherwise empty.
-    place: Ints = field(default_factory=lambda: np.empty((0, 0), np.int64))
+    #: (record, row): index of the line, or of the set of harmonics; otherwise empty.
+    line_index: Ints = field(default_factory=lambda: np.empty((0, 0), np.int64))
     #: (variant, row): log Bayes factors on the first record with their prior, or empty [nats].
     variant_nats: Array = field(default_factory=lambda: np.empty((0, 0)))
 

@@ -1,4 +1,4 @@
-"""Conditioning on named effects: given columns in every statistic, masked blocks, new weights."""
+"""Conditioning on named effects: given columns in every statistic, masked blocks, new powers."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.regression.nonnegative import solve_bounded
 
 #: Least ratio of fitted to expected power. Design choice.
-MIN_POWER_RATIO = 0.2
+MIN_FITTED_POWER_RATIO = 0.2
+SCORING_STEPS = 4  # of Fisher scoring, which fits powers
 
 
 def condition_on(state: State, components: list[Component]) -> State:
     """Add an effect to the state and refit the powers."""
-    return refit_weights(condition_on_components(state, components))
+    return refit_powers(condition_on_components(state, components))
 
 
 def condition_on_components(state: State, components: Iterable[Component]) -> State:
@@ -60,26 +61,26 @@ def find_bands(blocks: xr.Dataset, frequency: float) -> Ints:
 
 def free_shape(state: State, axis: str) -> State:
     """Add any spectrum of constant shape to the powers of an axis."""
-    bands = state.weight.shape[2]
+    shape = state.expected_power.shape[1:]
     return state.with_columns(
-        "power", axis, [np.broadcast_to(band, state.weight.shape[1:]) for band in np.eye(bands)]
+        "power", axis, [np.broadcast_to(band, shape) for band in np.eye(shape[1])]
     )
 
 
-def refit_weights(state: State) -> State:
-    """Set the weights by a fit of all given power columns (Fisher scoring, gamma likelihood)."""
-    weight = state.weight.copy()
+def refit_powers(state: State) -> State:
+    """Set the expected powers by a fit of all given power columns (Fisher scoring, gamma law)."""
+    power = state.expected_power.copy()
     for row, axis in enumerate(state.axes):
         if state.power_columns(axis):
-            weight[row] = fit_powers(state, axis)
+            power[row] = fit_powers(state, axis)
     return replace(
-        state, weight=weight, blocks=drop_changed_tails(state.blocks, weight, state.settings)
+        state, expected_power=power, blocks=drop_changed_tails(state.blocks, power, state.settings)
     )
 
 
 def fit_powers(state: State, axis: str, left_out: Bools | None = None) -> Floats:
     """Fit the powers of an axis, (block, band), and leave some of its power columns out of them."""
-    row, shape = state.axes.index(axis), state.weight.shape[1:]
+    row, shape = state.axes.index(axis), state.expected_power.shape[1:]
     expected = axis_values(state.baseline, "spectrum", axis)
     level, precision, low = noise_columns(state.baseline, axis=axis)
     level_count = level.shape[2]
@@ -94,7 +95,7 @@ def fit_powers(state: State, axis: str, left_out: Bools | None = None) -> Floats
     sizes = state.recall(partial(_fit_sizes, *inputs), b"powers", *inputs)
     if left_out is not None:
         sizes = np.where(np.append(np.zeros(level_count, np.bool_), left_out), 0.0, sizes)
-    return np.maximum(expected + columns @ sizes, MIN_POWER_RATIO * expected)
+    return np.maximum(expected + columns @ sizes, MIN_FITTED_POWER_RATIO * expected)
 
 
 def drop_changed_tails(
@@ -113,14 +114,11 @@ def drop_changed_tails(
         np.abs(level - np.median(level, axis=1, keepdims=True)) > settings.max_level_step
     )
     out = blocks.copy()
-    left_out: dict[str, tuple[Bools, float]]
-    left_out = {"kurtosis": (unusual, np.nan), "outliers": (turns, 0)}
-    for name, (where, replacement) in left_out.items():
+    replacements: dict[str, tuple[Bools, float]]
+    replacements = {"kurtosis": (unusual, np.nan), "outliers": (turns, 0)}
+    for name, (where, replacement) in replacements.items():
         out[name].values = np.where(where, replacement, out[name].values)
     return out
-
-
-_ROUNDS = 4  # steps of Fisher scoring
 
 
 def _fit_sizes(
@@ -137,7 +135,7 @@ def _fit_sizes(
     columns = columns / size
     good = np.isfinite(power) & np.isfinite(shape)
     fitted, sizes = flat, np.zeros(size.size)
-    for _ in range(_ROUNDS):
+    for _ in range(SCORING_STEPS):
         w = np.where(good, shape / fitted**2, 0.0)
         w = np.where(np.isfinite(w), w, 0.0)
         normal = (columns * w[:, None]).T @ columns + np.diag(prior / size**2)
@@ -145,5 +143,5 @@ def _fit_sizes(
         normal += np.diag(np.where(diagonal > 0.0, 1e-9 * diagonal, 1.0))  # 1 where nothing shows
         right = columns.T @ (w * np.where(good, power - flat, 0.0))
         sizes = solve_bounded(normal, right, low * size)
-        fitted = np.maximum(flat + columns @ sizes, MIN_POWER_RATIO * flat)
+        fitted = np.maximum(flat + columns @ sizes, MIN_FITTED_POWER_RATIO * flat)
     return np.asarray(sizes / size)

@@ -16,7 +16,7 @@ import xarray as xr
 from gyrostab.arrays import Array, Bools
 from gyrostab.diagnose.evidence.held_out import LinearModel
 from gyrostab.diagnose.predict.candidates import Candidate, content_digest
-from gyrostab.diagnose.reduce.block_statistics import measured, pair_indices
+from gyrostab.diagnose.reduce.schema import pair_indices, read_as_measured
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.expected import correlated_powers
 from gyrostab.kernels.spectra.periodogram import band_edges, ordinates, taper
@@ -31,13 +31,14 @@ class State:
 
     blocks: xr.Dataset
     baseline: xr.Dataset
-    #: (axis, block, band): powers that define the weights of all cells [degree2 hour-2 Hz-1]:
-    #: expected, plus those of the named effects.
-    weight: Array
+    #: (axis, block, band): expected powers with the named effects [degree2 hour-2 Hz-1]. They give
+    #: the variance, and so the weight, of every cell.
+    expected_power: Array
     masked: Bools  # (axis, block): blocks whose powers and cross-spectra are left out
-    #: (statistic, row) -> columns in the model with and without a candidate; the row is an axis, or
-    #: the two axes of a pair with a comma between them. Powers that effects add, whose sizes cannot
-    #: be negative, are under "added_power", all others under "power".
+    #: (data, row) -> columns in the model with and without a candidate. The data are "mean",
+    #: "power", "added_power" (powers that effects add, whose sizes cannot be negative), "cross",
+    #: "sub_block", "order", "phase_locked" or "transfer"; the row is an axis, or the two axes of a
+    #: pair with a comma between them. ("line", "all") has the lines that are explained, as masks.
     given: dict[tuple[str, str], list[Array]] = field(default_factory=dict)
     settings: Settings = DEFAULTS
     #: What was computed for the record, in any of its states, by the digest of the inputs.
@@ -47,22 +48,23 @@ class State:
         """Compute something, or recall what the same inputs gave before.
 
         Most of what a search tries again has not changed: an effect on one axis changes nothing on
-        the others, and a line nothing in the means.
+        the others, and a line nothing in the means. Bytes among the inputs name the computation:
+        two computations on the same arrays need different ones.
         """
         key = content_digest(*inputs)
         if key not in self.memory:
             self.memory[key] = compute()
         return cast(Result, self.memory[key])
 
-    def given_to(self, statistic: str, axis: str) -> Array | None:
-        """Return the given columns of a statistic of an axis, (..., column); None without any."""
-        columns = self.given.get((statistic, axis))
+    def given_to(self, data: str, axis: str) -> Array | None:
+        """Return the given columns of such data of an axis, (..., column); None without any."""
+        columns = self.given.get((data, axis))
         return np.stack(columns, axis=-1) if columns else None
 
-    def with_columns(self, statistic: str, row: str, columns: Sequence[Array]) -> State:
+    def with_columns(self, data: str, row: str, columns: Sequence[Array]) -> State:
         """Return the state with more given columns."""
         given = dict(self.given)
-        given[statistic, row] = [*given.get((statistic, row), []), *columns]
+        given[data, row] = [*given.get((data, row), []), *columns]
         return replace(self, given=given)
 
     def power_columns(self, axis: str) -> list[Array]:
@@ -86,8 +88,8 @@ def initial_state(
     blocks: xr.Dataset, baseline: xr.Dataset, *, settings: Settings = DEFAULTS
 ) -> State:
     """Return the state in which no effect is named."""
-    weight = baseline["spectrum"].values
-    return State(blocks, baseline, weight, np.zeros(weight.shape[:2], np.bool_), settings=settings)
+    power = baseline["spectrum"].values
+    return State(blocks, baseline, power, np.zeros(power.shape[:2], np.bool_), settings=settings)
 
 
 def simulate_noise(model: LinearModel, rng: np.random.Generator, count: int) -> LinearModel:
@@ -196,24 +198,25 @@ def linear_model(
     designs: Iterable[Iterable[Array]],
     given: Sequence[Array],
     *,
-    known: Sequence[Array] = (),
+    noise_columns: Sequence[Array] = (),
     precision: Any = (),
     is_bounded: Sequence[bool] = (),
     low: Sequence[float] = (),
 ) -> LinearModel:
     """Return a linear model of cells (block, cell) from columns of any shape that suits them.
 
-    The given columns are known ones with a prior precision, and nearly free ones of named effects;
-    `low` are their least sizes, if any. The sizes of designs cannot be negative where `is_bounded`.
+    In the model without a design are `noise_columns` with a prior `precision`, and nearly free ones
+    of named effects, which are `given`; `low` are the least sizes of both, if any. The sizes of
+    designs cannot be negative where `is_bounded`.
     """
     return LinearModel(
         values,
         weight,
         [stack_columns(design, weight.shape) for design in designs],
-        stack_columns([*known, *given], weight.shape),
+        stack_columns([*noise_columns, *given], weight.shape),
         np.diag([*precision, *[-1.0] * len(given)]),
         is_bounded,
-        np.array(low) if len(low) else np.full(len(known) + len(given), -np.inf),
+        np.array(low) if len(low) else np.full(len(noise_columns) + len(given), -np.inf),
     )
 
 
@@ -239,7 +242,7 @@ def power_column(density: Array, row: int, state: State) -> Array:
     mixed = mix_with_mean(
         select_row(density, row), unspread_share(state.blocks)[row], band_widths(state.blocks)
     )
-    return np.broadcast_to(mixed, state.weight.shape[1:])
+    return np.broadcast_to(mixed, state.expected_power.shape[1:])
 
 
 def cross_column(density: Array, row: int, blocks: xr.Dataset) -> Array:
@@ -256,7 +259,7 @@ def expected_cross(baseline: xr.Dataset) -> Array | None:
 def reference_channel_power(name: str, blocks: xr.Dataset) -> Array:
     """Return the power of a channel on the log's time, or of an axis as measured, (block, band)."""
     if name in blocks["axis"].values:
-        return np.asarray(measured(blocks, "power").sel(axis=name).values)
+        return np.asarray(read_as_measured(blocks, "power").sel(axis=name).values)
     return np.asarray(blocks["reference_power"].sel(reference=name).values)
 
 

@@ -25,7 +25,7 @@ class Trial(NamedTuple):
     data: xr.Dataset
     state: State
     folds: xr.DataArray
-    counts: CountEvidence | None = None
+    count_evidence: CountEvidence | None = None
     rng: np.random.Generator | None = None
 
     @property
@@ -59,8 +59,8 @@ def compute_evidence(
     trial = Trial(data, state, folds, count_evidence, rng)
     groups: dict[tuple[object, ...], list[Candidate]] = {}
     for candidate in candidates:
-        kind = (candidate.statistic, candidate.reference, candidate.is_per_axis)
-        groups.setdefault(kind, []).append(candidate)
+        group_key = (candidate.statistic, candidate.reference, candidate.is_per_axis)
+        groups.setdefault(group_key, []).append(candidate)
     return [
         evidence
         for group in groups.values()
@@ -95,11 +95,19 @@ def combine_rows(evidence_nats: Floats) -> Floats:
 
 
 def collect_evidence(
-    group: Sequence[Candidate], rows: list[tuple[str, ...]], factors: list[Floats], spread: int = 1
+    group: Sequence[Candidate],
+    rows: list[tuple[str, ...]],
+    factors: list[Floats],
+    designs_per_variant: int = 1,
 ) -> list[CandidateEvidence]:
-    """Compute the held-out evidence of a group from the factors of all variants, by row."""
+    """Compute the held-out evidence of a group from the factors of all variants, by row.
+
+    A variant has several designs where each set of harmonics is one; the evidence then has the
+    index of the best.
+    """
     variants = [
-        [variant for variant in candidate.variants for _ in range(spread)] for candidate in group
+        [variant for variant in candidate.variants for _ in range(designs_per_variant)]
+        for candidate in group
     ]
     owner = np.repeat(np.arange(len(group)), [len(group_variants) for group_variants in variants])
     weight = np.array([variant.weight for group_variants in variants for variant in group_variants])
@@ -117,8 +125,8 @@ def collect_evidence(
         best = tuple(variants[number][at] for at in place.tolist())
         evidence = CandidateEvidence(candidate, rows, evidence_nats[number], best)
         out.append(
-            replace(evidence, place=place[None])
-            if spread > 1
+            replace(evidence, line_index=place[None])
+            if designs_per_variant > 1
             else replace(evidence, variant_nats=variant_nats)
         )
     return out

@@ -72,7 +72,7 @@ def linear_mixture(component: Component, state: State, variant: Variant) -> Mixt
     row = candidate.statistic.rows(candidate, state).index(component.row)
     model = candidate.statistic.model([candidate], row, state.blocks, state)
     # several designs belong to a variant only for the rotation, where the place selects one
-    design = model.designs[max(component.place, 0) if candidate.statistic.is_rotation else 0]
+    design = model.designs[max(component.line_index, 0) if candidate.statistic.is_rotation else 0]
     columns = np.concatenate([design, model.given], axis=2).reshape(
         -1, design.shape[2] + model.given.shape[2]
     )

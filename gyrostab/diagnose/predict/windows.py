@@ -18,7 +18,7 @@ from gyrostab.diagnose.predict.candidates import (
     Variant,
 )
 from gyrostab.diagnose.predict.linear_model import with_correlated_powers
-from gyrostab.diagnose.reduce.block_statistics import measured
+from gyrostab.diagnose.reduce.schema import read_as_measured
 from gyrostab.physics.base import Effect, driver_error
 from gyrostab.physics.prediction import Prediction, Windows
 from gyrostab.physics.registry import effects
@@ -49,7 +49,9 @@ def make_windows(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
     `drivers` has the channels of the log by channel of the effect.
     """
     axes = tuple(str(axis) for axis in blocks["axis"].values)
-    means = dict(zip(axes, map(fill_linearly, measured(blocks, "mean").values), strict=True))
+    means = dict(
+        zip(axes, map(fill_linearly, read_as_measured(blocks, "mean").values), strict=True)
+    )
 
     def spans(name: str) -> Array:
         return np.stack(
@@ -320,7 +322,7 @@ def make_surrogates(
     drivers = driver_names(candidate)
     windows = make_windows(blocks, drivers)
     channels = {inner: blocks[f"channel_{name}"].values for inner, name in drivers.items()}
-    means = measured(blocks, "mean").values
+    means = read_as_measured(blocks, "mean").values
 
     def shift_windows(shift: int) -> Windows:
         def rotate(values: Array) -> Array:

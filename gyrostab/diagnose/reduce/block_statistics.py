@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from scipy.fft import prev_fast_len
 
-from gyrostab.arrays import Bools, Floats, Ints
+from gyrostab.arrays import Bools
 from gyrostab.diagnose.reduce.accumulate import Accumulator
 from gyrostab.diagnose.reduce.label_statistics import label_statistics
 from gyrostab.diagnose.reduce.log_blocks import count_samples, read_batches
@@ -22,10 +22,9 @@ _MIN_DEFAULT_BLOCKS = 90  # shorter blocks in shorter records; design choice
 _MAX_BLOCKS = 1000  # longer blocks in records above 5.6 h; bounds memory and time
 _MIN_BLOCK_SAMPLES = 100  # of a default block; design choice
 MIN_BLOCKS = 24  # fewer are refused: held-out stretches and calibration need them
-_MIN_NEIGHBOUR_RATIO = 2.0  # times expected density from which noise near an order is significant
 
 
-def block_samples(size: int, rate: float, block: Any = None) -> int:
+def choose_block_length(size: int, rate: float, block: Any = None) -> int:
     """Choose the block length: 20 s, less in short records, more beyond 5.6 h; in samples.
 
     The length is a product of small primes. A requested one is a duration, or a number of samples
@@ -38,8 +37,10 @@ def block_samples(size: int, rate: float, block: Any = None) -> int:
 
     Examples
     --------
-    >>> block_samples(360_000, 100.0), block_samples(72_001, 200.0), block_samples(8_641, 100.0)
-    (2000, 800, 100)
+    >>> choose_block_length(360_000, 100.0), choose_block_length(72_001, 200.0)
+    (2000, 800)
+    >>> choose_block_length(8_641, 100.0)
+    100
     """
     if block is None:
         default_length = max(
@@ -115,51 +116,15 @@ def reduce_log(
     """
     check_log(log)
     rate, size = float(log.attrs["sampling_rate_hz"]), count_samples(log)
-    length = block_samples(size, rate, block)
+    length = choose_block_length(size, rate, block)
     work = Accumulator(log, length, size // length, rate)
-    sample_count = work.rows * work.block_count * length
+    sample_count = work.row_count * work.block_count * length
     progress("reducing", sample_count)
     for batch in read_batches(log, length):
         stop = batch.first + batch.values.shape[1]
         if left_out is not None:
-            batch.values[: work.axes][left_out[:, batch.first : stop]] = np.nan
+            batch.values[: work.axis_count][left_out[:, batch.first : stop]] = np.nan
         work.add(batch)
-        progress("reducing", sample_count, work.rows * stop * length)
-    return label_statistics(work, log, restart=duration_seconds(restart_gap, "restart_gap"))
-
-
-def pair_indices(blocks: xr.Dataset) -> Ints:
-    """Return the indices of the first and of the second axes of all pairs, (2, pair)."""
-    axes = blocks["axis"].values.tolist()
-    sides = [[axes.index(axis) for axis in blocks[name].values] for name in ("first", "second")]
-    return np.array(sides, np.int64)
-
-
-def measured(blocks: xr.Dataset, name: str) -> xr.DataArray:
-    """Return a variable of the block statistics as measured, including what motion left out."""
-    return blocks[f"measured_{name}"] if f"measured_{name}" in blocks else blocks[name]
-
-
-def noise_at_orders(blocks: xr.Dataset, expected: Floats) -> Floats:
-    """Return the noise density near the rotation orders, as expected or as measured next to them.
-
-    Waves unrelated to the tool, such as those of the ground, have the same power at an order as
-    next to it. A density that the order itself raises is not noise: the measured density next to it
-    gives the level of the expected one, and replaces it in blocks with much more. Densities are by
-    (..., axis, block, harmonic).
-    """
-    if "order_level" not in blocks:
-        return expected
-    nearby = blocks["order_level"].values
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = nearby / expected
-    usual = np.isfinite(ratio) & (ratio <= _MIN_NEIGHBOUR_RATIO)
-    number = usual.sum(axis=-2, keepdims=True)
-    level = np.where(usual, ratio, 0.0).sum(axis=-2, keepdims=True) / np.maximum(number, 1)
-    return np.where(ratio > _MIN_NEIGHBOUR_RATIO, nearby, expected * np.where(number, level, 1.0))
-
-
-def iso(blocks: xr.Dataset, seconds: float) -> str:
-    """Write a time [s since the start of the record] as ISO 8601."""
-    start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
-    return f"{(start + np.timedelta64(round(seconds * 1e9), 'ns')).astype('datetime64[ms]')}Z"
+        progress("reducing", sample_count, work.row_count * stop * length)
+    restart_gap_s = duration_seconds(restart_gap, "restart_gap")
+    return label_statistics(work, log, restart_gap_s=restart_gap_s)

@@ -21,6 +21,22 @@ from gyrostab.diagnose.reduce.rotation_orders import HARMONICS
 from gyrostab.diagnose.reduce.schema import COORDINATES, label_variables, weighted_mean
 from gyrostab.diagnose.reduce.zero_bin import BINS, bin_widths, empty_zone, sticking_value
 from gyrostab.kernels.regression.smooth import smooth_curve
+from gyrostab.kernels.samples.moments import (
+    FOURTH_MOMENT,
+    HIGH_REPEATS,
+    HIGHEST,
+    HIGHS,
+    LOW_REPEATS,
+    LOWEST,
+    LOWS,
+    MEAN,
+    PRESENT,
+    REPEAT_RUNS,
+    REPEATS,
+    VARIANCE,
+    ZERO_RUNS,
+    ZEROS,
+)
 from gyrostab.schema import GAP_CAUSES, texts
 from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
@@ -29,83 +45,37 @@ _MAX_SMOOTHING_BLOCKS = 2.0  # longest time scale of the smoothing of a channel;
 _STEP_VALUES_PER_BLOCK = 256  # values from which the quantization step is found; limits time
 MIN_MEAN_SHARE = 0.1  # of a block that must be present for its mean; design choice
 _MIN_GAP_S = 1.0  # shorter gaps are not listed; design choice
-_AS_MEASURED = (
+#: Variables that are taken unchanged from the batches.
+_UNCHANGED = (
     "shape", "neighbours", "adjacent", "sub_block_mean", "sub_block_samples", "order",
     "order_samples", "order_level", "turn_mean", "turn_power", "profile", "profile_samples",
 )  # fmt: skip
 
 
-def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> xr.Dataset:
+def label_statistics(work: Accumulator, log: xr.Dataset, *, restart_gap_s: float) -> xr.Dataset:
     """Assemble the dataset of block statistics."""
-    by_name, axes = work.collect(), slice(0, work.axes)
-    counts, moments = by_name["counts"][axes], by_name["moments"][axes]
-    present = counts[..., 0]
+    by_name, axis_rows = work.collect(), slice(0, work.axis_count)
+    counts, moments = by_name["counts"][axis_rows], by_name["moments"][axis_rows]
+    present = counts[..., PRESENT]
     enough = present >= max(MIN_MEAN_SHARE * work.length, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        kurtosis = moments[..., 2] / moments[..., 1] ** 2 - 3.0
-    peaks, outliers = count_outliers(by_name["histogram"], work.peaks)
-    subset, at_once = np.array(list(work.at_once), np.bool_), np.stack(list(work.at_once.values()))
-    filled = zeros_beyond_chance(by_name["common_zeros"], counts[..., 1], present, subset, at_once)
-    samples = np.stack(work.kept_samples, axis=1)  # (axis, block, sample)
-    steps = np.array(
-        [quantization_step(first.ravel()) for first in samples[..., :_STEP_VALUES_PER_BLOCK]]
-    )
-    # on a quantization grid equal values are frequent by chance
-    resent = np.where(steps[:, None, None] > 0.0, 0, by_name["resent"])
-    samples = samples.reshape(work.axes, -1)
-    widths = np.array([*map(bin_widths, samples, steps)])
-    centres, per_repeat = np.transpose([*map(sticking_value, samples, steps)])
-    zones = np.array([*map(empty_zone, samples - np.nan_to_num(centres)[:, None])])
-    lowest, highest = _record_range(moments)
-    at_ends = _count_at_range_ends(moments, counts[..., 3:5])
-    # held samples; those at zero or at an end of the range have another cause
-    repeats = counts[..., 2] - _count_at_range_ends(moments, counts[..., 5:7]).sum(axis=-1)
-    # zeros of one axis alone, unless zero is the end of its range
-    stuck = np.where((lowest < 0.0) & (highest > 0.0), counts[..., 1] - filled, 0)
-    sticks = np.isfinite(centres)[:, None]
-    stuck = np.where(sticks, np.rint(repeats * per_repeat[:, None]).astype(np.int64), stuck)
-    line_total, line_square = np.moveaxis(work.line_counts, -1, 0)
-    weight: Floats = np.zeros(line_total.shape)
-    np.divide(line_total**2, line_square, where=line_square > 0, out=weight)
-    weight *= _equal_block_share(by_name["power"][axes], by_name["shape"], present, weight.shape[1])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        lines = work.line_sum / (work.line_expected * work.rate)
+        kurtosis = moments[..., FOURTH_MOMENT] / moments[..., VARIANCE] ** 2 - 3.0
     arrays: dict[str, Any] = {
-        "mean": np.where(enough, moments[..., 0], np.nan),
-        "variance": np.where(enough, moments[..., 1], np.nan),
+        "mean": np.where(enough, moments[..., MEAN], np.nan),
+        "variance": np.where(enough, moments[..., VARIANCE], np.nan),
         "samples": present,
-        "power": by_name["power"][axes],
+        "power": by_name["power"][axis_rows],
         "kurtosis": np.where(np.isnan(by_name["neighbours"]), np.nan, kurtosis),
-        "peaks": peaks,
-        "outliers": outliers,
-        "repeats": repeats + resent[..., 0],
-        "repeat_runs": counts[..., 7] + resent[..., 1],
-        "resent": resent[..., 0],
-        "zero_runs": counts[..., 8],
-        "extremes": at_ends.sum(axis=-1),
-        "range_end": np.concatenate([lowest, highest], axis=1),
-        "range_end_samples": at_ends.sum(axis=1),
-        "zeros": counts[..., 1],
-        "stuck": stuck,
-        "filled": filled,
-        "axes_at_once": subset,
-        "at_once": at_once,
-        "quantization_step": steps,
-        "line_power": lines,
-        "line_weight": weight,
-        "bin_width": widths[:, 0],
-        "bin_width_stderr": widths[:, 1],
-        "zone_centre": centres,
-        "zone_width": zones[:, 0],
-        "zone_width_stderr": zones[:, 1],
+        **_count_anomalous_samples(work, by_name),
+        **_average_line_spectra(work, by_name["power"][axis_rows], by_name["shape"], present),
     }
-    arrays |= {name: by_name[name] for name in _AS_MEASURED if name in by_name}
+    arrays |= {name: by_name[name] for name in _UNCHANGED if name in by_name}
     if work.rotation is not None:
         with np.errstate(invalid="ignore", divide="ignore"):
             arrays["turn_line_power"] = work.turn_line_sum / (work.turn_line_expected * work.rate)
     coordinates = _make_coordinates(work, log)
     frequencies = coordinates["line_frequency"][1]
-    arrays |= work.sines.strongest(frequencies) | _gap_table(work, log, restart)
+    arrays |= work.sines.strongest(frequencies) | _gap_table(work, log, restart_gap_s)
     variables = (
         label_variables(arrays)
         | _cross_spectra(work, by_name, log)
@@ -115,8 +85,73 @@ def label_statistics(work: Accumulator, log: xr.Dataset, *, restart: float) -> x
     if work.ramp is not None:
         variables |= label_variables({"ramp_turns": by_name["ramp_turns"][0]})
         variables["ramp_turns"][2].update(zip(("low", "high"), work.ramp_range, strict=True))
-    attrs = _make_attributes(work, log, present) | {"restart_gap_s": restart}
+    attrs = _make_attributes(work, log, present) | {"restart_gap_s": restart_gap_s}
     return xr.Dataset(variables, coords=coordinates, attrs=attrs)
+
+
+def _count_anomalous_samples(work: Accumulator, by_name: Mapping[str, Array]) -> dict[str, Any]:
+    """Return the sample counts of every block, and quantization and zero bin of each axis."""
+    axis_rows = slice(0, work.axis_count)
+    counts, moments = by_name["counts"][axis_rows], by_name["moments"][axis_rows]
+    zeros = counts[..., ZEROS]
+    outlier_count, outliers = count_outliers(by_name["histogram"], work.peaks)
+    subset, at_once = np.array(list(work.at_once), np.bool_), np.stack(list(work.at_once.values()))
+    filled = zeros_beyond_chance(
+        by_name["common_zeros"], zeros, counts[..., PRESENT], subset, at_once
+    )
+    samples = np.stack(work.kept_samples, axis=1)  # (axis, block, sample)
+    steps = np.array(
+        [quantization_step(first.ravel()) for first in samples[..., :_STEP_VALUES_PER_BLOCK]]
+    )
+    # on a quantization grid equal values are frequent by chance
+    resent = np.where(steps[:, None, None] > 0.0, 0, by_name["resent"])
+    samples = samples.reshape(work.axis_count, -1)
+    widths = np.array([*map(bin_widths, samples, steps)])
+    centres, per_repeat = np.transpose([*map(sticking_value, samples, steps)])
+    zones = np.array([*map(empty_zone, samples - np.nan_to_num(centres)[:, None])])
+    lowest, highest = _record_range(moments)
+    at_ends = _count_at_range_ends(moments, counts[..., [LOWS, HIGHS]])
+    # held samples; those at zero or at an end of the range have another cause
+    end_repeats = _count_at_range_ends(moments, counts[..., [LOW_REPEATS, HIGH_REPEATS]])
+    repeats = counts[..., REPEATS] - end_repeats.sum(axis=-1)
+    # zeros of one axis alone, unless zero is the end of its range
+    stuck_at_zero = np.where((lowest < 0.0) & (highest > 0.0), zeros - filled, 0)
+    stuck_at_centre = np.rint(repeats * per_repeat[:, None]).astype(np.int64)
+    return {
+        "outlier_count": outlier_count,
+        "outliers": outliers,
+        "repeats": repeats + resent[..., 0],
+        "repeat_runs": counts[..., REPEAT_RUNS] + resent[..., 1],
+        "resent": resent[..., 0],
+        "zero_runs": counts[..., ZERO_RUNS],
+        "extremes": at_ends.sum(axis=-1),
+        "range_end": np.concatenate([lowest, highest], axis=1),
+        "range_end_samples": at_ends.sum(axis=1),
+        "zeros": zeros,
+        "stuck": np.where(np.isfinite(centres)[:, None], stuck_at_centre, stuck_at_zero),
+        "filled": filled,
+        "axes_at_once": subset,
+        "at_once": at_once,
+        "quantization_step": steps,
+        "bin_width": widths[:, 0],
+        "bin_width_stderr": widths[:, 1],
+        "zone_centre": centres,
+        "zone_width": zones[:, 0],
+        "zone_width_stderr": zones[:, 1],
+    }
+
+
+def _average_line_spectra(
+    work: Accumulator, power: Floats, shape: Floats, present: Ints
+) -> dict[str, Any]:
+    """Return the mean periodogram of each part of the record, and how many equal ones it has."""
+    total, square = np.moveaxis(work.line_weight_sums, -1, 0)
+    weight: Floats = np.zeros(total.shape)
+    np.divide(total**2, square, where=square > 0, out=weight)
+    weight *= _equal_block_share(power, shape, present, weight.shape[1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        lines = work.line_sum / (work.line_expected * work.rate)
+    return {"line_power": lines, "line_weight": weight}
 
 
 def _equal_block_share(power: Floats, shape: Floats, samples: Ints, part_count: int) -> Floats:
@@ -145,36 +180,36 @@ def _equal_block_share(power: Floats, shape: Floats, samples: Ints, part_count: 
 
 def _record_range(moments: Floats) -> tuple[Floats, Floats]:
     """Return the smallest and largest value of every axis, (axis, 1)."""
-    lowest = np.fmin.reduce(moments[..., 3], axis=1, keepdims=True)
-    return lowest, np.fmax.reduce(moments[..., 4], axis=1, keepdims=True)
+    lowest = np.fmin.reduce(moments[..., LOWEST], axis=1, keepdims=True)
+    return lowest, np.fmax.reduce(moments[..., HIGHEST], axis=1, keepdims=True)
 
 
 def _count_at_range_ends(moments: Floats, counts: Ints) -> Ints:
     """Keep counts at both ends (axis, block, 2) where those of a block are those of the record."""
     lowest, highest = _record_range(moments)
-    at_top = (moments[..., 4] == highest) & (lowest < highest)
-    return np.where(np.stack([moments[..., 3] == lowest, at_top], axis=-1), counts, 0)
+    at_top = (moments[..., HIGHEST] == highest) & (lowest < highest)
+    return np.where(np.stack([moments[..., LOWEST] == lowest, at_top], axis=-1), counts, 0)
 
 
 def _cross_spectra(
     work: Accumulator, by_name: Mapping[str, Array], log: xr.Dataset
 ) -> dict[str, Any]:
     """Return cross-spectra of the axes, and of each axis with the channels on the log's time."""
-    axes = work.axes
-    axis_pairs = [number for number, (_, other) in enumerate(work.pairs) if other < axes]
+    axis_count = work.axis_count
+    axis_pairs = [number for number, (_, other) in enumerate(work.pairs) if other < axis_count]
     names = ("cross", "cross_shape", "cross_neighbours", "cross_samples")
     variables = label_variables({name: by_name[name][axis_pairs] for name in names})
     if work.channels:
-        shape = (axes, len(work.channels), *by_name["cross"].shape[1:])
+        shape = (axis_count, len(work.channels), *by_name["cross"].shape[1:])
         with_axes = np.full(shape, np.nan + 0j)
         for number, (a, b) in enumerate(work.pairs):
-            if b >= axes:
-                with_axes[a, b - axes] = by_name["cross"][number]
+            if b >= axis_count:
+                with_axes[a, b - axis_count] = by_name["cross"][number]
         unit_list = ", ".join(
             f"{name} in {log[name].attrs.get('units', '1')}" for name in work.channels
         )
         references = label_variables(
-            {"reference_power": by_name["power"][axes:], "reference_cross": with_axes}
+            {"reference_power": by_name["power"][axis_count:], "reference_cross": with_axes}
         )
         for _, _, attrs in references.values():
             attrs["units"] += f" ({unit_list})"
@@ -192,10 +227,9 @@ def _channel_means(
     for name in (*on_log_time, *on_own_time):
         rms = is_rms_channel(name)
         if name in on_log_time:
-            mean, spread = np.moveaxis(
-                by_name["moments"][work.axes + on_log_time.index(name), :, :2], -1, 0
-            )
-            values = np.sqrt(mean**2 + spread) if rms else mean
+            moments = by_name["moments"][work.axis_count + on_log_time.index(name)]
+            mean, variance = moments[:, MEAN], moments[:, VARIANCE]
+            values = np.sqrt(mean**2 + variance) if rms else mean
         else:
             values = channel_means(log, name, edges, rms=rms)
         attrs = {
@@ -243,22 +277,22 @@ def _channel_part_means(
     return variables
 
 
-def _gap_table(work: Accumulator, log: xr.Dataset, restart: float) -> dict[str, Any]:
+def _gap_table(work: Accumulator, log: xr.Dataset, restart_gap_s: float) -> dict[str, Any]:
     """Return gaps, and those after which the tool restarted, in seconds since the start."""
     complete = work.gap_ends[: len(work.gap_ends) // 2 * 2]  # not that at the end of the record
     gaps = np.array(complete, dtype=np.float64).reshape(-1, 2)
     gaps = gaps[np.diff(gaps)[:, 0] >= _MIN_GAP_S * work.rate] / work.rate
-    starts = gaps[gaps[:, 1] - gaps[:, 0] >= restart].tolist()
+    restart_spans = gaps[gaps[:, 1] - gaps[:, 0] >= restart_gap_s].tolist()
     if "gap_cause" in log.variables:
         is_restart = log["gap_cause"].values == GAP_CAUSES.index("restart")
         ends = [to_nanoseconds(log[name].values[is_restart]) for name in ("gap_start", "gap_end")]
         known_restarts = grid_index(work.start, work.rate, np.stack(ends, axis=-1)) / work.rate
-        starts += [
+        restart_spans += [
             span
             for span in known_restarts.tolist()
-            if not any(low <= span[1] and span[0] <= high for low, high in starts)
+            if not any(low <= span[1] and span[0] <= high for low, high in restart_spans)
         ]
-    restarts = np.array(sorted(starts), dtype=np.float64).reshape(-1, 2)
+    restarts = np.array(sorted(restart_spans), dtype=np.float64).reshape(-1, 2)
     return {
         "gap_begin": gaps[:, 0],
         "gap_end": gaps[:, 1],
@@ -271,13 +305,15 @@ def _make_coordinates(work: Accumulator, log: xr.Dataset) -> dict[str, Any]:
     ends = np.arange(work.block_count + 1) * work.length
     stamps = grid_times(work.start, work.rate, ends)
     step = work.rate / work.length
-    axes = np.array([str(name) for name in log["axis"].values], dtype=object)
-    pairs = np.array([pair for pair in work.pairs if pair[1] < work.axes], np.int64).reshape(-1, 2)
+    axis_names = np.array([str(name) for name in log["axis"].values], dtype=object)
+    pairs = np.array([pair for pair in work.pairs if pair[1] < work.axis_count], np.int64).reshape(
+        -1, 2
+    )
     arrays: dict[str, Any] = {
         "bin": np.array(BINS, dtype=object),
-        "axis": axes,
-        "first": axes[pairs[:, 0]],
-        "second": axes[pairs[:, 1]],
+        "axis": axis_names,
+        "first": axis_names[pairs[:, 0]],
+        "second": axis_names[pairs[:, 1]],
         "time": (stamps[:-1] + np.diff(stamps) // 2).view("datetime64[ns]"),
         "begin": ends[:-1] / work.rate,
         "end": ends[1:] / work.rate,

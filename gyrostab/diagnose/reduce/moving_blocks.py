@@ -26,10 +26,11 @@ MAD_TO_SIGMA = 1.4826  # median absolute deviation of a normal law
 #: The means do not move by a few samples that are one quantization step from all others.
 EQUAL_SCATTER, ROUNDING = 1e-3, 1e-9
 REST_ROUNDS = 3  # in which centre and scatter at rest are refined
-_KEPT_STATISTICS = ("mean", "power", "cross")
+#: Variables of moving blocks that are kept as ``measured_<name>``.
+_MEASURED_STATISTICS = ("mean", "power", "cross")
 
 
-def moving_blocks(blocks: xr.Dataset, *, settings: Settings = DEFAULTS) -> Bools:
+def find_moving_blocks(blocks: xr.Dataset, *, settings: Settings = DEFAULTS) -> Bools:
     """Find the blocks (axis, block) in which an axis moves far beyond its scatter at rest.
 
     Examples
@@ -37,11 +38,14 @@ def moving_blocks(blocks: xr.Dataset, *, settings: Settings = DEFAULTS) -> Bools
     >>> from gyrostab.ingest.make_log import make_log
     >>> rate = np.random.default_rng(1).standard_normal((2, 60_000))
     >>> rate[1, 20_000:30_000] += 500.0
-    >>> moving_blocks(reduce_log(make_log(rate, rate=100.0, unit="deg/h"), block="5s")).sum(axis=1)
+    >>> blocks = reduce_log(make_log(rate, rate=100.0, unit="deg/h"), block="5s")
+    >>> find_moving_blocks(blocks).sum(axis=1)
     array([ 0, 24])
     """
     span = sample_range(blocks)
-    return np.stack([moving_blocks_of_axis(mean, span, settings) for mean in blocks["mean"].values])
+    return np.stack(
+        [find_moving_blocks_of_axis(mean, span, settings) for mean in blocks["mean"].values]
+    )
 
 
 def sample_range(blocks: xr.Dataset) -> float:
@@ -49,7 +53,7 @@ def sample_range(blocks: xr.Dataset) -> float:
     return float(np.ptp(blocks["range_end"].values))
 
 
-def moving_blocks_of_axis(mean: Floats, span: float, settings: Settings) -> Bools:
+def find_moving_blocks_of_axis(mean: Floats, span: float, settings: Settings) -> Bools:
     """Find the moving blocks of one axis of a record whose samples have the range `span`.
 
     The level at rest is where a quarter of the means lie closest together, if a third of the record
@@ -137,7 +141,7 @@ def without_motion(
     same = f"{blocks.attrs['block_samples']}samples"
     out = reduce_log(log, block=same, restart_gap=restart_gap, left_out=moving, progress=progress)
     out = out.drop_dims(["gap", "restart"]).assign(
-        {f"measured_{name}": blocks[name] for name in _KEPT_STATISTICS}
+        {f"measured_{name}": blocks[name] for name in _MEASURED_STATISTICS}
         | {name: blocks[name] for name in ("gap_begin", "gap_end", "restart_begin", "restart_end")}
     )
     out["moving"] = (

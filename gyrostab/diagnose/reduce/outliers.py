@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from gyrostab.arrays import Array, Bools, Floats, Ints
-from gyrostab.kernels.spectra.outliers import HISTOGRAM, departures, histogram_edge, peaks
+from gyrostab.kernels.samples.outliers import HISTOGRAM, departures, histogram_edge, peaks
 
 #: Expected number of false outliers of an axis in a record of Gaussian noise. Design choice.
 EXPECTED_FALSE_OUTLIERS = 0.02
@@ -29,11 +29,11 @@ _NORMAL_MEDIAN_ABS = 0.6745  # median of |x| of a standard normal variable
 
 
 class Peaks(NamedTuple):
-    """Isolated extreme samples of an axis, from `gyrostab.kernels.spectra.outliers.peaks`."""
+    """Samples of an axis that may be outliers, from `gyrostab.kernels.samples.outliers.peaks`."""
 
-    block: Ints
-    size: Floats
-    level: Floats
+    block: Ints  # (peak,)
+    size: Floats  # (peak,): departure from the neighbours
+    level: Floats  # (peak,): standard deviation of the noise right before or after it
 
 
 def find_peaks(values: Floats, histogram: NDArray[np.uint32]) -> Peaks:
@@ -71,7 +71,7 @@ def outlier_limit(samples: float) -> float:
 def count_outliers(
     histogram: NDArray[np.uint32], peaks: Sequence[Sequence[Peaks]]
 ) -> tuple[Ints, Ints]:
-    """Count outliers, and weigh them: beyond twice the limit one counts three times.
+    """Return the number of outliers, and their number with those beyond twice the limit thrice.
 
     The limit is the number of standard deviations of the departures that Gaussian noise as long as
     the record exceeds `EXPECTED_FALSE_OUTLIERS` times. The deviation is from the median: the larger
@@ -91,8 +91,8 @@ def count_outliers(
     >>> x[7, 100] += 30.0
     >>> x[9, 100] += 7.0
     >>> histogram = np.zeros((1, 50, HISTOGRAM), np.uint32)
-    >>> number, outliers = count_outliers(histogram, [[find_peaks(x, histogram[0])]])
-    >>> number[0, [7, 9]], outliers[0, [7, 9]], int(number.sum())
+    >>> outlier_count, outliers = count_outliers(histogram, [[find_peaks(x, histogram[0])]])
+    >>> outlier_count[0, [7, 9]], outliers[0, [7, 9]], int(outlier_count.sum())
     (array([1, 1]), array([3, 1]), 2)
     """
     sums = np.pad(np.cumsum(histogram, axis=1, dtype=np.int64), ((0, 0), (1, 0), (0, 0)))
@@ -104,20 +104,20 @@ def count_outliers(
     adjacent = np.maximum(adjacent[:, :-2], adjacent[:, 2:])
     usual = np.maximum(np.maximum(narrow, wide), 0.1 * _deviation_from_median(sums[:, -1:]))
     scale = np.where(adjacent > _NOISIER_NEIGHBOUR_RATIO * usual, adjacent, usual)
-    number, outliers = np.zeros((2, *scale.shape), np.int64)
+    outlier_count, outliers = np.zeros((2, *scale.shape), np.int64)
     for axis, batches in enumerate(peaks):
         limit = _fluctuating_level_limit(histogram[axis], scale[axis])
         for batch_peaks in batches:
             departure = batch_peaks.size / np.maximum(
                 scale[axis, batch_peaks.block], batch_peaks.level
             )
-            np.add.at(number[axis], batch_peaks.block, departure > limit)
+            np.add.at(outlier_count[axis], batch_peaks.block, departure > limit)
             np.add.at(
                 outliers[axis],
                 batch_peaks.block,
                 np.where(departure > 2.0 * limit, 3, 1) * (departure > limit),
             )
-    return number, outliers
+    return outlier_count, outliers
 
 
 def _fluctuating_level_limit(histogram: NDArray[np.uint32], scale: Floats) -> float:
@@ -214,11 +214,13 @@ def simultaneous_samples(present: Bools) -> dict[tuple[bool, ...], Ints]:
     """
     axes = len(present)
     code = (present * (1 << np.arange(axes, dtype=np.int64))[:, None, None]).sum(axis=0)
-    number_by_kind = {
-        tuple(bool(kind >> axis & 1) for axis in range(axes)): np.count_nonzero(code == kind, -1)
-        for kind in np.unique(code).tolist()
+    number_by_set = {
+        tuple(bool(bits >> axis & 1) for axis in range(axes)): np.count_nonzero(code == bits, -1)
+        for bits in np.unique(code).tolist()
     }
-    return {kind: number_by_kind[kind] for kind in sorted(number_by_kind) if sum(kind) > 1}
+    return {
+        axis_set: number_by_set[axis_set] for axis_set in sorted(number_by_set) if sum(axis_set) > 1
+    }
 
 
 def zeros_beyond_chance(

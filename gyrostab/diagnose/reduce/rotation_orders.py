@@ -25,6 +25,7 @@ _NEIGHBOURS = np.array([-4, -3, -2, -1, 1, 2, 3, 4])
 #: from which a block is not fitted, such as one that lost the samples of a turn. Design choice:
 #: half of the samples determine the amplitude.
 _MAX_VARIANCE_RATIO = 2.0
+_MIN_NEIGHBOUR_RATIO = 2.0  # times expected density from which noise near an order is significant
 _MIN_TURNS_APART = 0.9  # turns per block from a line that was removed; just below one DFT bin
 
 
@@ -168,3 +169,22 @@ def _level_near_order(
     free = (np.abs(place[..., None] - removed) >= _MIN_TURNS_APART).all(axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray((power * free).sum(axis=-1) / (noise_left * free).sum(axis=-1))
+
+
+def noise_at_orders(blocks: xr.Dataset, expected: Floats) -> Floats:
+    """Return the noise density near the rotation orders, as expected or as measured next to them.
+
+    Waves unrelated to the tool, such as those of the ground, have the same power at an order as
+    next to it. A density that the order itself raises is not noise: the measured density next to it
+    gives the level of the expected one, and replaces it in blocks with much more. Densities are by
+    (..., axis, block, harmonic).
+    """
+    if "order_level" not in blocks:
+        return expected
+    nearby = blocks["order_level"].values
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = nearby / expected
+    usual = np.isfinite(ratio) & (ratio <= _MIN_NEIGHBOUR_RATIO)
+    number = usual.sum(axis=-2, keepdims=True)
+    level = np.where(usual, ratio, 0.0).sum(axis=-2, keepdims=True) / np.maximum(number, 1)
+    return np.where(ratio > _MIN_NEIGHBOUR_RATIO, nearby, expected * np.where(number, level, 1.0))

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from gyrostab.arrays import Array, Floats
+from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.noise import LAWS, TERMS
 from gyrostab.units import INNER
 
@@ -42,9 +42,11 @@ BLOCK_STATISTICS: dict[str, Variable] = {
     "shape": Variable(_BAND, "1", "shape of the gamma distribution of the power in white noise"),
     "neighbours": Variable(_BLOCK, "1", "share of neighbouring pairs of samples, tapered"),
     "kurtosis": Variable(_BLOCK, "1", "excess kurtosis of the block"),
-    "peaks": Variable(_BLOCK, "1", "isolated outliers"),
+    "outlier_count": Variable(_BLOCK, "1", "isolated outliers"),
     "outliers": Variable(
-        _BLOCK, "1", "isolated outliers, three times those beyond twice the limit"
+        _BLOCK,
+        "1",
+        "isolated outliers; one beyond twice the limit counts three times, see `outlier_count`",
     ),
     "adjacent": Variable(_BLOCK, "1", "samples with another one right before them in the block"),
     "repeats": Variable(
@@ -204,7 +206,7 @@ BASELINE: dict[str, Variable] = {
     "form_shape": Variable(("axis", "band"), "1", "shape of the distribution of the form"),
     "lines": Variable(_LINE, _POWER, "expected power of steady lines without gaps"),
     "lines_most": Variable(_LINE, _POWER, "largest power of them at any offset of the frequency"),
-    "peaks": Variable(_LINE, _POWER, "expected power of broad peaks"),
+    "broad_peaks": Variable(_LINE, _POWER, "expected power of broad peaks"),
     "line_noise": Variable(_LINE, _POWER, "expected power of noise behind a filter"),
     "line_shape": Variable(_LINE, "1", "ratio of line power to that interpolated from the bands"),
     "line_spectrum": Variable(("axis", "band"), _POWER, "expected power of lines in the bands"),
@@ -237,6 +239,24 @@ def axis_values(dataset: xr.Dataset, name: str, axis: str | int) -> Floats:
     row = axis if isinstance(axis, int) else dataset.variables["axis"].values.tolist().index(axis)
     variable = dataset.variables[name]
     return np.asarray(np.moveaxis(variable.values, variable.dims.index("axis"), 0)[row])
+
+
+def pair_indices(blocks: xr.Dataset) -> Ints:
+    """Return the indices of the first and of the second axes of all pairs, (2, pair)."""
+    axes = blocks["axis"].values.tolist()
+    sides = [[axes.index(axis) for axis in blocks[name].values] for name in ("first", "second")]
+    return np.array(sides, np.int64)
+
+
+def read_as_measured(blocks: xr.Dataset, name: str) -> xr.DataArray:
+    """Return a variable of the block statistics as measured, including what motion left out."""
+    return blocks[f"measured_{name}"] if f"measured_{name}" in blocks else blocks[name]
+
+
+def format_time(blocks: xr.Dataset, seconds: float) -> str:
+    """Write a time [s since the start of the record] as ISO 8601."""
+    start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
+    return f"{(start + np.timedelta64(round(seconds * 1e9), 'ns')).astype('datetime64[ms]')}Z"
 
 
 def weighted_mean(values: Array, weight: Floats, axis: int = 0) -> tuple[Array, Floats]:

@@ -37,16 +37,16 @@ _STRENGTHS = 3.0 * 3.0 ** np.arange(12)
 class _Spectrum:
     """Sum of periodograms of one length."""
 
-    def __init__(self, axes: int, size: int) -> None:
+    def __init__(self, axis_count: int, size: int) -> None:
         lines, self.size, self.taper = ordinates(_FINER * size), size, taper(size)
-        self.total = np.zeros((axes, lines))  # [degree2 hour-2 Hz-1]
-        self.used = np.zeros(axes, np.int64)  # their number
-        self.in_line = np.zeros(axes)  # sum of the shares of a sine's power in its line
+        self.total = np.zeros((axis_count, lines))  # [degree2 hour-2 Hz-1]
+        self.used = np.zeros(axis_count, np.int64)  # their number
+        self.in_line = np.zeros(axis_count)  # sum of the shares of a sine's power in its line
         # bands of noise: first line, and number of lines
         self.edges = np.linspace(0, lines, min(_NOISE_BANDS, lines), endpoint=False).astype(int)
         self.widths = np.diff(self.edges, append=lines)
         # (axis, band): sum of the levels, and that of the noisiest periodogram
-        self.band_total, self.band_largest = np.zeros((2, axes, self.edges.size))
+        self.band_total, self.band_largest = np.zeros((2, axis_count, self.edges.size))
 
     def add(self, axis: int, values: Floats, rate: float) -> None:
         """Add the periodogram of some samples of an axis, if enough are present."""
@@ -66,7 +66,7 @@ class _Spectrum:
         self.band_largest[axis] = np.maximum(self.band_largest[axis], level)
 
     def equal_count(self) -> Floats:
-        """Return (axis, band) how many equal periodograms have a sum with this upper tail.
+        """Return how many equal periodograms have a sum with this upper tail, (axis, band).
 
         A noisier stretch leaves fewer: with a single one, the sum is an exponential variable.
         """
@@ -80,15 +80,15 @@ class _Spectrum:
 class SineSearch:
     """Periodograms of long segments of the axes of a log, filled block by block."""
 
-    def __init__(self, axes: int, block_count: int, length: int, rate: float):
+    def __init__(self, axis_count: int, block_count: int, length: int, rate: float):
         segments = -(-block_count * length // _MAX_SAMPLES)
         blocks = block_count // segments
         self.rate, self.length = rate, length
         sizes = [blocks // parts * length for parts in _PARTS if blocks >= 2 * parts]
         # none in blocks so long that hardly one fits a segment
-        self.segment = np.full((axes, blocks * length if sizes else 0), np.nan)
+        self.segment = np.full((axis_count, blocks * length if sizes else 0), np.nan)
         self.filled = 0
-        self.spectra = [_Spectrum(axes, size) for size in sizes]
+        self.spectra = [_Spectrum(axis_count, size) for size in sizes]
 
     def add(self, values: Floats) -> None:
         """Add the samples (axis, sample) that follow; NaN where missing."""
@@ -98,11 +98,15 @@ class SineSearch:
             self.filled, values = self.filled + count, values[:, count:]
             if self.filled == self.segment.shape[1]:
                 self.filled = 0
-                for spectrum in self.spectra:
-                    size = spectrum.size
-                    for begin in range(0, self.segment.shape[1] - size + 1, size):
-                        for axis, part in enumerate(self.segment[:, begin : begin + size]):
-                            spectrum.add(axis, part, self.rate)
+                self._transform_segment()
+
+    def _transform_segment(self) -> None:
+        """Add the periodograms of the segment, and of its parts, to the spectra."""
+        for spectrum in self.spectra:
+            size = spectrum.size
+            for begin in range(0, self.segment.shape[1] - size + 1, size):
+                for axis, part in enumerate(self.segment[:, begin : begin + size]):
+                    spectrum.add(axis, part, self.rate)
 
     def strongest(self, lines: Floats) -> dict[str, Any]:
         """Return the strongest sine nearest to each line (frequencies [Hz], evenly spaced).
@@ -110,8 +114,7 @@ class SineSearch:
         The variables are described in `gyrostab.diagnose.reduce.schema.BLOCK_STATISTICS`; the
         evidence is minus infinity without a search.
         """
-        axes = self.segment.shape[0]
-        unknown = np.full((axes, lines.size), np.nan)
+        unknown = np.full((self.segment.shape[0], lines.size), np.nan)
         out: dict[str, Any] = {
             "sine_nats": np.full(unknown.shape, -np.inf),
             "sine_frequency": lines.copy(),
@@ -145,10 +148,10 @@ class SineSearch:
         usable = (spectrum.used > 0) & spectrum.total.any(axis=1)  # a constant axis has no noise
         if frequency.size < _MIN_LEVELS * width or not usable.any():
             return None
-        of_bands = spectrum.equal_count()
+        band_counts = spectrum.equal_count()
         count, median = (
             np.repeat(part, spectrum.widths, axis=1)[:, inside]
-            for part in (of_bands, gammaincinv(of_bands, 0.5) / of_bands)
+            for part in (band_counts, gammaincinv(band_counts, 0.5) / band_counts)
         )
         mean = spectrum.total[:, inside] / np.maximum(spectrum.used, 1)[:, None]
         power = np.where(usable[:, None], mean, 1.0)
@@ -162,8 +165,8 @@ class SineSearch:
         order = np.lexsort((total, place))
         last = np.append(np.flatnonzero(np.diff(place[order])), order.size - 1)
         chosen = order[last]
-        gains = factor[:, chosen] - math.log(2.0)
-        sharing = np.maximum((gains > 0.0).sum(axis=0), 1)
+        axis_nats = factor[:, chosen] - math.log(2.0)
+        sharing = np.maximum((axis_nats > 0.0).sum(axis=0), 1)
         leak = np.arange(-_FINER * LEAK_LINES, _FINER * LEAK_LINES + 1)
         neighbours = np.clip(chosen[:, None] + leak, 0, frequency.size - 1)
         # (axis, line, neighbour)
@@ -178,7 +181,7 @@ class SineSearch:
         total_weight = np.maximum(weights.sum(axis=-1), 1e-300)
         centre = (weights * frequency[neighbours]).sum(axis=-1) / total_weight
         arrays = {
-            "sine_nats": gains - cost / sharing,
+            "sine_nats": axis_nats - cost / sharing,
             "sine_frequency": centre,
             "sine_resolution": np.full(chosen.size, _FINER * step),
             "sine_square": scale * above.sum(axis=-1),

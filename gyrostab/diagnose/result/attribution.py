@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache, partial
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Floats
-from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_motion
-from gyrostab.diagnose.identify.identification import Selection, components_of
-from gyrostab.diagnose.locate.mismatches import Region
+from gyrostab.diagnose.baseline.known_effects import (
+    find_blocks_with_known_motion,
+    remove_known_motion,
+)
+from gyrostab.diagnose.identify.selections import Selection, components_of
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import drop_changed_tails, find_bands, mean_columns
@@ -19,11 +22,22 @@ from gyrostab.diagnose.predict.linear_model import pair_rows
 from gyrostab.diagnose.reduce.schema import weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS, find_statistic
+from gyrostab.diagnose.statistics.base import Region
 from gyrostab.diagnose.statistics.sample_counts import find_anomalous_blocks, mask_anomalous_blocks
 
 MAX_SPANS = 6  # more intervals than that are reported as the whole record
+_WHOLE_SHARE = 0.9  # of the blocks, above which an effect acts in the whole record; design choice
+_PAUSES_IN_RECORD = 50  # a pause that fits this often into the record is bridged; design choice
 #: Name, scores and standardised scores of each statistic.
 _Scores = Sequence[tuple[str, xr.Dataset, Floats]]
+
+
+class _TimedEffect(NamedTuple):
+    """An identified effect, and when it acts [s]."""
+
+    identification: Selection
+    active_spans: list[tuple[float, float]]
+    moving_spans: list[tuple[float, float]]  # in which it moves the rate within blocks
 
 
 def active_blocks(
@@ -43,7 +57,7 @@ def active_blocks(
             continue
         if not component.statistic.has_course or design.size == 0:
             return np.ones(block_count, bool)
-        place = [number for number, size in enumerate(design.shape) if size == block_count]
+        place = [axis for axis, length in enumerate(design.shape) if length == block_count]
         if not place:
             return np.ones(block_count, bool)
         size = np.asarray(np.moveaxis(np.asarray(design), place[0], 0).reshape(block_count, -1))
@@ -77,12 +91,12 @@ def join_blocks(is_inside: Bools, begin: Floats, end: Floats) -> list[tuple[floa
     >>> join_blocks(np.array([0, 0, 1, 1, 1, 0, 0, 0, 0, 0], bool), t, t + 1)
     [(2.0, 5.0)]
     """
-    if is_inside.mean() > 0.9:
+    if is_inside.mean() > _WHOLE_SHARE:
         return [(float(begin[0]), float(end[-1]))]
     edges = np.flatnonzero(np.diff(is_inside, prepend=False, append=False)).reshape(-1, 2)
     joined: list[list[int]] = []
     for first, stop in edges.tolist():
-        if joined and first - joined[-1][1] <= max(1, is_inside.size // 50):
+        if joined and first - joined[-1][1] <= max(1, is_inside.size // _PAUSES_IN_RECORD):
             joined[-1][1] = stop
         else:
             joined.append([first, stop])
@@ -100,7 +114,7 @@ def attribute_mismatches(
     *,
     level: float,
     without: Callable[[Sequence[Selection]], xr.Dataset] | None = None,
-    still: xr.Dataset | None = None,
+    lines_at_rest: xr.Dataset | None = None,
 ) -> list[list[str]]:
     """Find the effects that explain each mismatch.
 
@@ -112,8 +126,9 @@ def attribute_mismatches(
     power and the lowest lines exceed the noise; the effect explains these too.
 
     `after` is the baseline with the effects, and `without` returns that except for those given, at
-    the sizes of the joint fit. Without it, every effect at the place of a mismatch explains it.
-    `still` has line spectra without the blocks in which an effect moves the rate.
+    the sizes of the joint fit. Without it, whether an effect is needed is not tested: every effect
+    at the place of a mismatch explains it. `lines_at_rest` has line spectra without the blocks in
+    which an effect moves the rate.
     """
     settings = null.settings
 
@@ -121,54 +136,37 @@ def attribute_mismatches(
     def scores_without(out: tuple[Selection, ...]) -> _Scores:
         remaining = [identification for identification in identified if identification not in out]
         baseline = without(out) if without is not None and out else after
-        return _statistic_scores(blocks, baseline, null, located, remaining, still=still)
+        return _statistic_scores(
+            blocks, baseline, null, located, remaining, lines_at_rest=lines_at_rest
+        )
 
     def score_without(region: Region, out: Sequence[Selection]) -> tuple[float, float]:
         return _score_left(region, scores_without(tuple(out)), null, level)
 
-    when = [_explained_spans(identification, blocks, settings) for identification in identified]
-    moves = [
-        _moving_spans(identification, blocks, after, settings) for identification in identified
+    timed_effects = [
+        _TimedEffect(
+            identification,
+            _explained_spans(identification, blocks, settings),
+            _moving_spans(identification, blocks, after, settings),
+        )
+        for identification in identified
     ]
     explained = []
     for region in located:
         score, limit = score_without(region, ())
-        axes = set(str(region["axes"]).split())
         shown = []
-        for identification, its_time, its_moves in zip(identified, when, moves, strict=True):
-            moved = _is_within_blocks(region, blocks) and any(
-                _overlap_seconds(region, span) > 0.0 for span in its_moves
+        for effect in timed_effects:
+            without_it = partial(score_without, region, (effect.identification,))
+            components = _components_at(
+                region,
+                effect,
+                blocks,
+                settings,
+                is_left=score >= limit,
+                score_without=None if without is None else without_it,
             )
-            components = [
-                component
-                for component in identification.components
-                if component.statistic.can_explain(component, region, blocks, settings)
-                and (moved or not component.statistic.is_in_means or region["view"] != "spectrum")
-            ]
-            common = axes & set(identification.axes)
-            if not components or not common:
-                continue
-            together = str(region["what"]) == "slow" and len(common) > 1
-            if score >= limit and all(
-                component.statistic.is_modelled_in(region, together=together)
-                for component in components
-            ):
-                continue
-            if (
-                moved
-                or any(
-                    _overlap_seconds(region, (begin, end))
-                    >= settings.overlap_share * min(region["end"] - region["begin"], end - begin)
-                    for begin, end in its_time
-                )
-                or (
-                    without is not None
-                    and _is_caused_elsewhere(
-                        region, components, partial(score_without, region, (identification,))
-                    )
-                )
-            ):
-                shown.append((identification, components))
+            if components:
+                shown.append((effect.identification, components))
         is_gone = without is not None and score < limit
         needed = (
             needed_effects(region, shown, partial(score_without, region), settings=settings)
@@ -177,6 +175,49 @@ def attribute_mismatches(
         )
         explained.append(list(dict.fromkeys(identification.effect for identification in needed)))
     return explained
+
+
+def _components_at(
+    region: Region,
+    effect: _TimedEffect,
+    blocks: xr.Dataset,
+    settings: Settings,
+    *,
+    is_left: bool,
+    score_without: Callable[[], tuple[float, float]] | None,
+) -> list[Component]:
+    """Return the components of an effect that may explain a mismatch; empty if it cannot.
+
+    `is_left` says whether the mismatch is left with all effects in the baseline, `score_without`
+    returns its score and limit without this one.
+    """
+    has_moved = _is_within_blocks(region, blocks) and any(
+        _overlap_seconds(region, span) > 0.0 for span in effect.moving_spans
+    )
+    components = [
+        component
+        for component in effect.identification.components
+        if component.statistic.can_explain(component, region, blocks, settings)
+        and (has_moved or not component.statistic.is_in_means or region["view"] != "spectrum")
+    ]
+    common = set(region["axes"].split()) & set(effect.identification.axes)
+    if not components or not common:
+        return []
+    together = region["quantity"] == "slow" and len(common) > 1
+    if is_left and all(
+        component.statistic.is_modelled_in(region, together=together) for component in components
+    ):
+        return []
+    is_at_its_time = has_moved or any(
+        _overlap_seconds(region, (begin, end))
+        >= settings.overlap_share * min(region["end"] - region["begin"], end - begin)
+        for begin, end in effect.active_spans
+    )
+    if is_at_its_time or (
+        score_without is not None and _is_caused_elsewhere(region, components, score_without)
+    ):
+        return components
+    return []
 
 
 def drop_expected(
@@ -227,7 +268,7 @@ def _is_caused_elsewhere(
     The constant of a record is free: a mean that is higher in one part is lower in the rest, and
     either may be the mismatch. A mean that differs after a restart may be due to an effect before.
     """
-    if str(region["view"]) not in ("mean", "restart") or not all(
+    if region["view"] not in ("mean", "restart") or not all(
         component.statistic.is_in_means for component in components
     ):
         return False
@@ -254,9 +295,9 @@ def _overlap_seconds(region: Region, span: tuple[float, float]) -> float:
 
 def _is_within_blocks(region: Region, blocks: xr.Dataset) -> bool:
     """Return whether a mismatch concerns the inside of blocks rather than their means."""
-    return str(region["view"]) in ("spectrum", "distribution") or float(
-        region["tau_max_s"]
-    ) < float(blocks.attrs["block_s"])
+    return region["view"] in ("spectrum", "distribution") or float(region["tau_max_s"]) < float(
+        blocks.attrs["block_s"]
+    )
 
 
 def _moving_spans(
@@ -264,7 +305,7 @@ def _moving_spans(
 ) -> list[tuple[float, float]]:
     """Return the blocks [s] in which an effect moves the rate of an axis within the block."""
     axes = [str(axis) for axis in blocks["axis"].values]
-    moving = expect_known_motion(blocks, after, settings=settings)
+    moving = find_blocks_with_known_motion(blocks, after, settings=settings)
     is_moving = np.zeros(blocks.sizes["block"], np.bool_)
     for component in (
         component
@@ -289,13 +330,13 @@ def _statistic_scores(
     regions: Sequence[Region],
     identified: Sequence[Selection],
     *,
-    still: xr.Dataset | None = None,
+    lines_at_rest: xr.Dataset | None = None,
 ) -> _Scores:
     """Score the recording against a baseline with effects.
 
     Statistics of whole blocks leave out those with anomalous samples of `identified`, and
     statistics of their inside those in which an effect moves the rate. The line statistics use the
-    lines of `still`, by default those of `blocks`.
+    lines of `lines_at_rest`, by default those of `blocks`.
     """
     out = []
     settings = null.settings
@@ -304,8 +345,8 @@ def _statistic_scores(
     masked = mask_anomalous_blocks(blocks, components_of(identified), settings)
     turns_left_out = drop_changed_tails(blocks, after["spectrum"].values, settings)
     lines = masked
-    if still is not None:
-        lines = masked.assign({name: still[name] for name in ("line_power", "line_weight")})
+    if lines_at_rest is not None:
+        lines = masked.assign({name: lines_at_rest[name] for name in ("line_power", "line_weight")})
     for statistic in STATISTICS:
         if statistic.name not in null.statistics:
             continue
@@ -331,9 +372,9 @@ def _with_shared_lines(
     because it shows what the block means have in common.
     """
     lines = [
-        (component.place, component.row[0])
+        (component.line_index, component.row[0])
         for component in components_of(identified)
-        if component.statistic.is_line and component.place >= 0
+        if component.statistic.is_line and component.line_index >= 0
     ]
     if len(lines) < 2:
         return after
@@ -363,22 +404,22 @@ def _score_left(
     for name, statistic, z in scores:
         if (
             find_statistic(name).view != region["view"]
-            or str(region["what"]) not in statistic["what"].values
+            or region["quantity"] not in statistic["quantity"].values
         ):
             continue
         rows = [
             number
             for number, axes in enumerate(statistic["axes"].values)
-            if set(str(axes).split()) & set(str(region["axes"]).split())
+            if set(str(axes).split()) & set(region["axes"].split())
         ]
         inside = (statistic["begin"].values >= region["begin"] - 1e-6) & (
             statistic["end"].values <= region["end"] + 1e-6
         )
-        columns = (statistic["what"].values == region["what"]) & (
+        columns = (statistic["quantity"].values == region["quantity"]) & (
             statistic["tau_min_s"].values >= 0.99 * region["tau_min_s"]
         )
         columns &= statistic["tau_min_s"].values <= 1.01 * region["tau_max_s"]
-        cells = np.abs(z[np.ix_(rows, inside, columns)])
+        cells = np.abs(z[np.ix_(np.array(rows, np.intp), inside, columns)])
         if np.isfinite(cells).any():
             largest_score = max(largest_score, float(np.nanmax(cells)))
             allowed = null.settings.score_error_share * abs(float(region["z"]))
@@ -411,7 +452,7 @@ def needed_effects(
         for identification, components in shown
         if all(
             # a low-pass may be in the noise of the baseline already
-            str(region["view"]) in component.statistic.contained_in and not component.is_filter
+            region["view"] in component.statistic.containing_views and not component.is_filter
             for component in components
         )
     ]

@@ -27,7 +27,7 @@ from gyrostab.diagnose.result.text import (
     without_chance,
 )
 from gyrostab.diagnose.settings import Settings, stored_settings
-from gyrostab.diagnose.statistics.wording import COARSE_ANGLE_GRID
+from gyrostab.diagnose.statistics.mismatch_wording import COARSE_ANGLE_GRID
 from gyrostab.physics.base import Effect
 
 
@@ -121,26 +121,26 @@ class Diagnosis:
         return "\n".join([*lines, *noise_texts(self.content)])
 
 
-def plain(value: Any) -> Any:
+def to_json_types(value: Any) -> Any:
     """Convert a value to what JSON allows.
 
     NumPy numbers become Python's, times ISO 8601, and values that are not finite null.
 
     Examples
     --------
-    >>> plain({"a": np.float64(0.5), "b": [np.nan, np.int64(3)]})
+    >>> to_json_types({"a": np.float64(0.5), "b": [np.nan, np.int64(3)]})
     {'a': 0.5, 'b': [None, 3]}
-    >>> plain(np.datetime64("2026-03-01T12:00", "ns"))
+    >>> to_json_types(np.datetime64("2026-03-01T12:00", "ns"))
     '2026-03-01T12:00:00.000Z'
     """
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_json_types(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
-        return plain(value.tolist() if value.dtype.kind != "M" else list(value))
+        return to_json_types(value.tolist() if value.dtype.kind != "M" else list(value))
     if isinstance(value, np.datetime64):
         return None if np.isnat(value) else f"{value.astype('datetime64[ms]')}Z"
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_json_types(item) for item in value]
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):

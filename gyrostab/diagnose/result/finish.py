@@ -18,15 +18,14 @@ from gyrostab.diagnose.estimate.joint_fit import Fitted, fit_expected, fit_ident
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, refer_to_kept_noise, with_noise
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
 from gyrostab.diagnose.identify.components import axes_of, sum_evidence
-from gyrostab.diagnose.identify.examination import Identifications
-from gyrostab.diagnose.identify.identification import Selection, reduce_selection
-from gyrostab.diagnose.locate.mismatches import Region
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import Selection, reduce_selection
 from gyrostab.diagnose.nulls.scores import NullScores
 from gyrostab.diagnose.predict.channel_use import unused_channels
 from gyrostab.diagnose.result.attribution import attribute_mismatches
 from gyrostab.diagnose.result.content import SCHEMA, check_diagnosis
-from gyrostab.diagnose.result.diagnosis import Diagnosis, plain
-from gyrostab.diagnose.result.held_out import measure_evidence
+from gyrostab.diagnose.result.diagnosis import Diagnosis, to_json_types
+from gyrostab.diagnose.result.held_out_table import measure_held_out
 from gyrostab.diagnose.result.rejections import find_rejections, find_unsupported, rejected_tables
 from gyrostab.diagnose.result.surfaces import make_surfaces
 from gyrostab.diagnose.result.tables import (
@@ -37,12 +36,13 @@ from gyrostab.diagnose.result.tables import (
     recording_table,
 )
 from gyrostab.diagnose.result.verdict import decide_verdict
+from gyrostab.diagnose.statistics.base import Region
 from gyrostab.diagnose.task import NamedBlocks, Task, lines_without_motion
 from gyrostab.physics.registry import effects
 from gyrostab.simulate.model import Model
 
 
-class Fit(NamedTuple):
+class FinalFit(NamedTuple):
     """The effects with their final sizes."""
 
     identifications: Identifications  # with designs for the noise below
@@ -57,14 +57,14 @@ def finish_diagnosis(
 ) -> Diagnosis:
     """Fit the identified effects, measure their evidence, and attribute the mismatches."""
     blocks, baseline = named.blocks, named.baseline
-    identifications, first, fit = fit_supported(named.identifications, baseline)
+    identifications, first_fit, fit = fit_supported(named.identifications, baseline)
     before = expected_baseline(fit.identifications, baseline)
     after = (
         predict_baseline(fit.identifications, fit.noise) if identifications.identified else before
     )
     mismatches = _attributed_mismatches(task, blocks, located, null, fit, after)
     unexplained = [region["id"] for region in mismatches if not region["explained_by"]]
-    held = measure_evidence(blocks, baseline, identifications, first)
+    held = measure_held_out(blocks, baseline, identifications, first_fit)
     effects = effect_tables(fit.fitted, blocks, settings=task.settings)
     # channels that an effect could follow, or was compared with
     used = {
@@ -101,7 +101,7 @@ def finish_diagnosis(
     turning = str(rotation.attrs.get("rotation_axis", ""))  # axis that feels this channel
     given_model = task.simulation if isinstance(task.simulation, Model) else None
     diagnosis = Diagnosis(
-        plain(content),
+        to_json_types(content),
         _make_surfaces_with_outliers(blocks, fit, before, after),
         model_tables(fit.noise, fit.fitted, given_model, blocks, turning, settings=task.settings),
     )
@@ -111,35 +111,35 @@ def finish_diagnosis(
 
 def fit_supported(
     identifications: Identifications, baseline: xr.Dataset
-) -> tuple[Identifications, list[Fitted], Fit]:
+) -> tuple[Identifications, list[Fitted], FinalFit]:
     """Fit the effects, and drop those whose size may be zero, until none is left to drop.
 
     Return the remaining effects, their sizes with the noise of `baseline`, and their sizes with the
     noise that they leave.
     """
     while True:
-        first = fit_identifications(identifications, baseline)
-        fit = refit_with_noise(identifications, baseline, first)
-        numbers = [
+        first_fit = fit_identifications(identifications, baseline)
+        fit = refit_with_noise(identifications, baseline, first_fit)
+        fits_by_identification = [
             [fitted for fitted in fit.fitted if fitted.identification is identification]
             for identification in fit.identifications.identified
         ]
-        supported = keep_supported(identifications, numbers)
+        supported = keep_supported(identifications, fits_by_identification)
         if supported is identifications:
-            return identifications, first, fit
+            return identifications, first_fit, fit
         identifications = supported
 
 
 def refit_with_noise(
-    identifications: Identifications, baseline: xr.Dataset, first: list[Fitted]
-) -> Fit:
-    """Calibrate the noise with the effects of the `first` fit in the model, and fit them again."""
-    noise = recalibrate(identifications, baseline, first)
-    fitted = first
+    identifications: Identifications, baseline: xr.Dataset, first_fit: list[Fitted]
+) -> FinalFit:
+    """Calibrate the noise with the effects of the first fit in the model, and fit them again."""
+    noise = recalibrate(identifications, baseline, first_fit)
+    fitted = first_fit
     if noise is not baseline:
         identifications = with_noise(identifications, noise)
         fitted = fit_identifications(identifications, noise)
-    return Fit(
+    return FinalFit(
         identifications,
         noise,
         refer_to_kept_noise(fitted, noise, identifications.state.blocks),
@@ -152,7 +152,7 @@ def _attributed_mismatches(
     blocks: xr.Dataset,
     located: Sequence[Region],
     null: NullScores,
-    fit: Fit,
+    fit: FinalFit,
     after: xr.Dataset,
 ) -> list[dict[str, Any]]:
     """Return the mismatches that were located or identified, each with what explains it."""
@@ -174,13 +174,13 @@ def _attributed_mismatches(
         null,
         level=task.level / 2.0,
         without=without,
-        still=lines,
+        lines_at_rest=lines,
     )
     return mismatch_tables(located, explained, fit.identifications, blocks)
 
 
 def _make_surfaces_with_outliers(
-    blocks: xr.Dataset, fit: Fit, before: xr.Dataset, after: xr.Dataset
+    blocks: xr.Dataset, fit: FinalFit, before: xr.Dataset, after: xr.Dataset
 ) -> xr.Dataset:
     """Return the surfaces with the power of outliers in both simulations."""
     before = add_outlier_power(before, blocks, fit.expected)
@@ -212,7 +212,7 @@ def supported_axes(fitted: Fitted) -> tuple[str, ...]:
 
 
 def keep_supported(
-    identifications: Identifications, fitted: Sequence[Sequence[Fitted]]
+    identifications: Identifications, fits_by_identification: Sequence[Sequence[Fitted]]
 ) -> Identifications:
     """Keep the effects whose size differs from zero, on the axes where it does.
 
@@ -221,10 +221,12 @@ def keep_supported(
     keeps all of its axes, `identifications` itself is returned.
     """
     identified: list[Selection] = []
-    unknown: list[Selection] = []
-    for identification, numbers in zip(identifications.identified, fitted, strict=True):
-        good = {axis for fitted_effect in numbers for axis in supported_axes(fitted_effect)}
-        if set(identification.axes) <= good or not numbers:
+    unidentified: list[Selection] = []
+    for identification, fits in zip(
+        identifications.identified, fits_by_identification, strict=True
+    ):
+        good = {axis for fitted in fits for axis in supported_axes(fitted)}
+        if set(identification.axes) <= good or not fits:
             identified.append(identification)
             continue
         supported = [
@@ -240,9 +242,9 @@ def keep_supported(
         )
         if sum_evidence(lost) > identification.threshold:
             strongest = max(lost, key=lambda component: component.evidence_nats).statistic
-            unknown.append(
+            unidentified.append(
                 Selection(
-                    strongest.nuisance_alternative,
+                    strongest.unsupported_as,
                     (),
                     axes_of(lost, identification.axes),
                     lost,
@@ -254,5 +256,7 @@ def keep_supported(
     if identified == [*identifications.identified]:
         return identifications
     return replace(
-        identifications, identified=tuple(identified), unknown=(*identifications.unknown, *unknown)
+        identifications,
+        identified=tuple(identified),
+        unidentified=(*identifications.unidentified, *unidentified),
     )

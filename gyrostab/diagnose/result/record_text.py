@@ -15,7 +15,7 @@ from gyrostab.diagnose.result.families import group_families
 from gyrostab.diagnose.result.text import plain_name
 from gyrostab.diagnose.result.verdict import doubtful_names, failed_checks
 from gyrostab.diagnose.settings import Settings, stored_settings
-from gyrostab.diagnose.statistics.wording import axes_text
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.wording import format_value, join_words
 
 

@@ -13,11 +13,11 @@ from gyrostab.diagnose.identify.components import (
     merge_lines,
     sum_evidence,
 )
-from gyrostab.diagnose.identify.examination import NUISANCE_ALTERNATIVES, Identifications
-from gyrostab.diagnose.identify.identification import Selection
-from gyrostab.diagnose.identify.selection import score_candidates
+from gyrostab.diagnose.identify.forward_search import score_candidates
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.identify.settling import find_instead, sum_by_key
-from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.candidates import NUISANCE_ALTERNATIVES, Component, is_nuisance
 
 _NOISE = "noise"
 
@@ -65,9 +65,9 @@ def find_rejections(identifications: Identifications) -> list[Rejection]:
     examination, state = identifications.examination, identifications.state
     all_evidence = score_candidates(examination, state, ())
     components = merge_lines(group_components(all_evidence, settings=examination.settings))
-    settled = [*identifications.identified, *identifications.unknown]
+    settled = [*identifications.identified, *identifications.unidentified]
     chosen = [*identifications.identified]
-    for selection in identifications.unknown:
+    for selection in identifications.unidentified:
         without = examination.state_with(settled, without=selection)
         instead_of_it, _ = find_instead(examination, selection, without)
         chosen.append(replace(selection, instead=sum_by_key(instead_of_it)))
@@ -77,7 +77,7 @@ def find_rejections(identifications: Identifications) -> list[Rejection]:
     out: dict[str, tuple[float, Rejection]] = {}
     for key, effect_components in components.items():
         effect = effect_components[0].candidate.effect
-        if key.startswith("~") or effect in named:
+        if is_nuisance(key) or effect in named:
             continue
         added_nats = sum_evidence(effect_components)
         required = examination.required_nats(effect_components, chosen)

@@ -12,7 +12,7 @@ from gyrostab.arrays import Floats
 from gyrostab.diagnose.reduce.schema import Variable, label_variables
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.mean import window_means
-from gyrostab.diagnose.statistics.scores import Windows, sum_over_windows
+from gyrostab.diagnose.statistics.scores import BlockWindows, sum_over_windows
 
 #: The three cases side by side: the simulation without and with the effects.
 CASES = ("recording", "before", "after")
@@ -48,7 +48,9 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
     windows = _make_windows(blocks.sizes["block"])
     plain = before.assign(known_mean=before["known_mean"] * 0.0)
     recorded = allan_surface(blocks, plain, windows)
-    keep = (recorded["columns"]["what"] == "avar") & np.isfinite(recorded["shape"]).any(axis=(0, 1))
+    keep = (recorded["columns"]["quantity"] == "avar") & np.isfinite(recorded["shape"]).any(
+        axis=(0, 1)
+    )
     avar = [recorded["observed"][..., keep]]
     low, high = ([np.full(avar[0].shape, np.nan)] for _ in range(2))
     mean = [_average_windows(blocks, blocks["mean"].values, windows)]
@@ -107,14 +109,14 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
     return out.set_coords(["time", "begin", "end", "tau"])
 
 
-def _make_windows(block_count: int) -> Windows:
+def _make_windows(block_count: int) -> BlockWindows:
     length = min(WINDOW_BLOCKS, max(1, block_count // 2))
     step = max(1, block_count // MAX_WINDOWS)
     first = np.arange(0, block_count - length + 1, step)
-    return Windows(first, first + length)
+    return BlockWindows(first, first + length)
 
 
-def _known_avar(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Floats:
+def _known_avar(blocks: xr.Dataset, baseline: xr.Dataset, windows: BlockWindows) -> Floats:
     """Return the Allan variance of the known mean, which that of the noise does not include."""
     means = np.where(np.isfinite(blocks["mean"].values), baseline["known_mean"].values, np.nan)
     known_only = blocks.assign(mean=(("axis", "block"), means))
@@ -130,7 +132,7 @@ def _known_avar(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> F
     )
 
 
-def _average_windows(blocks: xr.Dataset, values: Floats, windows: Windows) -> Floats:
+def _average_windows(blocks: xr.Dataset, values: Floats, windows: BlockWindows) -> Floats:
     """Average over windows, weighted with the samples present where the recording has a mean."""
     weight = np.where(np.isfinite(blocks["mean"].values), blocks["samples"].values, 0.0)
     sums = sum_over_windows(np.where(weight > 0, values, 0.0) * weight, windows, axis=-1)
@@ -139,7 +141,7 @@ def _average_windows(blocks: xr.Dataset, values: Floats, windows: Windows) -> Fl
         return np.asarray(np.where(total > 0, sums / total, np.nan))
 
 
-def _predicted_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> Floats:
+def _predicted_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: BlockWindows) -> Floats:
     """Return the window means of the effects plus the constant that fits the recording."""
     known_mean, mean = baseline["known_mean"].values, blocks["mean"].values
     weight = np.where(np.isfinite(mean), 1.0 / baseline["mean_variance"].values, 0.0)

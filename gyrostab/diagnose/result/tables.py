@@ -17,12 +17,12 @@ from gyrostab.diagnose.estimate.constant_rate import (
 )
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.components import are_lines
-from gyrostab.diagnose.identify.examination import NUISANCE_ALTERNATIVES, Identifications
-from gyrostab.diagnose.identify.identification import Selection, components_of
-from gyrostab.diagnose.locate.mismatches import Region
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import Selection, components_of
 from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
+from gyrostab.diagnose.predict.candidates import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.predict.windows import channel_units, make_windows
-from gyrostab.diagnose.reduce.block_statistics import iso, measured
+from gyrostab.diagnose.reduce.schema import format_time, read_as_measured
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
 from gyrostab.diagnose.result.diagnosis import effect_table
 from gyrostab.diagnose.result.families import find_families
@@ -38,8 +38,9 @@ from gyrostab.diagnose.result.text import (
 )
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.statistics.base import Region
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
-from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.noise import LAWS
 from gyrostab.physics.sampling import FAST_INSTRUMENT_SAMPLES, LoggerFilter
 from gyrostab.simulate.model import Model
@@ -120,7 +121,9 @@ def effect_tables(
                 "name": identification.effect,
                 "axes": list(fitted_effect.axes),
                 "driver": ",".join(filter(None, identification.driver)) or None,
-                "intervals": [[iso(blocks, low), iso(blocks, high)] for low, high in when],
+                "intervals": [
+                    [format_time(blocks, low), format_time(blocks, high)] for low, high in when
+                ],
                 "parameters": {
                     name: asdict(estimate) for name, estimate in fitted_effect.parameters.items()
                 },
@@ -263,8 +266,8 @@ def _make_mismatch(
     return {
         "view": view,
         "axes": list(axes),
-        "start": iso(blocks, span[0]),
-        "end": iso(blocks, span[1]),
+        "start": format_time(blocks, span[0]),
+        "end": format_time(blocks, span[1]),
         "tau_min_s": taus[0],
         "tau_max_s": taus[1],
         "ratio": None,
@@ -345,7 +348,7 @@ def unidentified_mismatches(
     null = fit_best_evidence(
         identifications.examination.null_best, settings=identifications.state.settings
     )
-    for unidentified in identifications.unknown:
+    for unidentified in identifications.unidentified:
         view = unidentified.components[0].statistic.view
         if any(
             region["view"] == view
@@ -398,7 +401,7 @@ def motion_mismatches(identified: Sequence[Selection], blocks: xr.Dataset) -> li
     if "moving" not in blocks:
         return []
     begin, end = blocks["begin"].values, blocks["end"].values
-    means = measured(blocks, "mean").values
+    means = read_as_measured(blocks, "mean").values
     out: list[dict[str, Any]] = []
     for row, axis in enumerate(map(str, blocks["axis"].values)):
         moving, mean = blocks["moving"].values[row], means[row]

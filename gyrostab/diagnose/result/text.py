@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gyrostab.diagnose.statistics import find_statistic
-from gyrostab.diagnose.statistics.wording import axes_text, subject
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text, capitalise_axes
 from gyrostab.physics.registry import effects
 from gyrostab.wording import join_words
 
@@ -91,19 +91,19 @@ def span_text(begin: float, end: float, whole: float) -> str:
 def mismatch_statement(region: Mapping[str, Any], whole: float) -> str:
     """Write one sentence on a place where recording and simulation differ.
 
-    It is a `gyrostab.diagnose.locate.mismatches.Region` with ``axes`` as a list.
+    It is a `gyrostab.diagnose.statistics.base.Region`, but with a list of axes.
 
     Examples
     --------
-    >>> mismatch_statement({"statistic": "power", "what": "avar", "axes": ["x"], "begin": 1500.0,
-    ...                     "end": 1800.0, "tau_min_s": 0.01, "tau_max_s": 3.0, "ratio": 1.8,
-    ...                     "sign": 1, "p_value": 0.0004, "estimate": 1.8}, 3600.0)
+    >>> mismatch_statement({"statistic": "power", "quantity": "avar", "axes": ["x"],
+    ...                     "begin": 1500.0, "end": 1800.0, "tau_min_s": 0.01, "tau_max_s": 3.0,
+    ...                     "ratio": 1.8, "sign": 1, "p_value": 0.0004, "estimate": 1.8}, 3600.0)
     'Axis x is noisier than the simulation from 25:00 to 30:00 after the start: at averaging times
      of 10 ms to 3 s its Allan variance is 1.8 times the expected value (noise alone would show
      this in 1 of 2 500 such records).'
     """
     when = span_text(region["begin"], region["end"], whole)
-    sentence = find_statistic(str(region["statistic"])).describe(region, when)
+    sentence = find_statistic(region["statistic"]).describe(region, when)
     return f"{sentence} ({chance(region['p_value'])})."
 
 
@@ -123,7 +123,7 @@ def motion_statement(axis: str, when: str, largest: float, followers: Sequence[s
     size = f"by up to {largest:.3g} deg/h"
     text = f"The rate of axis {axis} moves far beyond its noise {when}, {size}"
     if followers:
-        them = subject({"axes": followers})
+        them = capitalise_axes(followers)
         return (
             f"{text}. {them} {'senses' if len(followers) == 1 else 'sense'} part of it, so it "
             "is real rotation of the tool; no channel records its true rate."

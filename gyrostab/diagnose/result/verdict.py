@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
-from gyrostab.diagnose.identify.identification import Selection, own_form_error
+from gyrostab.diagnose.identify.selections import Selection, own_form_error
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
 

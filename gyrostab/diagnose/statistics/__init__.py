@@ -2,7 +2,8 @@
 
 To add a statistic, write its class in a module of this package and add one line to `STATISTICS`;
 docs/architecture.md has an example. All steps of the diagnosis loop over the registry, or hold the
-instance that a candidate belongs to.
+instance that a candidate belongs to. Modules that define no statistic: `base`, `build_candidates`,
+`jump_forms`, `mismatch_wording`, `sample_sizes`, `scores` and `shared_factors`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from gyrostab.diagnose.statistics.sample_counts import SampleCounts
 from gyrostab.diagnose.statistics.spectral_line import SpectralLine
 from gyrostab.diagnose.statistics.telegraph import Telegraph
 from gyrostab.diagnose.statistics.transfer import Transfer
-from gyrostab.diagnose.statistics.variance_stability import VarianceStability
+from gyrostab.diagnose.statistics.variance_fluctuation import VarianceFluctuation
 from gyrostab.diagnose.statistics.wandering_bias import WanderingBias
 
 __all__ = ["STATISTICS", "Statistic", "find_statistic"]
@@ -41,7 +42,7 @@ STATISTICS: tuple[Statistic, ...] = (
     Telegraph(),
     CommonMode(),
     Restart(),
-    VarianceStability(),
+    VarianceFluctuation(),
     DriftingLine(),
 )
 

@@ -9,7 +9,12 @@ import xarray as xr
 
 from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.wandering import allan_variance, expected_processes
-from gyrostab.diagnose.statistics.scores import Windows, cumulative, sum_over_windows, window_set
+from gyrostab.diagnose.statistics.scores import (
+    BlockWindows,
+    cumulative,
+    sum_over_windows,
+    window_set,
+)
 from gyrostab.noise import LAWS
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
@@ -45,7 +50,7 @@ def allan_transfer(low: Floats, high: Floats, tau: Floats, rate: float) -> Float
 
 
 def allan_surface(
-    blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows | None = None
+    blocks: xr.Dataset, baseline: xr.Dataset, windows: BlockWindows | None = None
 ) -> dict[str, Any]:
     """Compute observed and expected Allan variances, and the shape of their gamma distribution.
 
@@ -69,7 +74,7 @@ def allan_surface(
 
 @np.errstate(divide="ignore", invalid="ignore")
 def _surface_within_blocks(
-    blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
+    blocks: xr.Dataset, baseline: xr.Dataset, windows: BlockWindows
 ) -> dict[str, Any]:
     """Compute the surface within blocks, from band powers."""
     rate, block = float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
@@ -98,14 +103,16 @@ def _surface_within_blocks(
         "expected": expected / count,
         "shape": gamma,
         "columns": {
-            "what": np.array(["avar"] * k.size + ["level"], dtype="<U8"),
+            "quantity": np.array(["avar"] * k.size + ["level"], dtype="<U8"),
             "tau_min_s": np.append(k / rate, 1.0 / rate),
             "tau_max_s": np.append(k / rate, k[-1] / rate),
         },
     }
 
 
-def _surface_of_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> dict[str, Any]:
+def _surface_of_means(
+    blocks: xr.Dataset, baseline: xr.Dataset, windows: BlockWindows
+) -> dict[str, Any]:
     """Compute the surface at whole blocks, from all overlapping differences of block means."""
     block, block_count = float(blocks.attrs["block_s"]), blocks.sizes["block"]
     means = blocks["mean"].values - baseline["known_mean"].values
@@ -119,7 +126,7 @@ def _surface_of_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
             _pair_variance(white, k) + _walk_variance(walk, k)
         ) / 2.0 + _slow_allan_variance(blocks, baseline, k * block)[:, None]
         present = np.isfinite(d2) & np.isfinite(expected)
-        pairs = Windows(windows.first, np.maximum(windows.stop - 2 * k + 1, windows.first))
+        pairs = BlockWindows(windows.first, np.maximum(windows.stop - 2 * k + 1, windows.first))
         count = sum_over_windows(present.astype(float), pairs, axis=-1)
         with np.errstate(divide="ignore", invalid="ignore"):
             for name, values in (("observed", d2), ("expected", expected)):
@@ -133,7 +140,7 @@ def _surface_of_means(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
     }
     tau = np.array(sizes, dtype=float) * block
     joined["columns"] = {
-        "what": np.array(["avar"] * tau.size, dtype="<U8"),
+        "quantity": np.array(["avar"] * tau.size, dtype="<U8"),
         "tau_min_s": tau,
         "tau_max_s": tau,
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 import xarray as xr
@@ -13,7 +13,7 @@ from gyrostab.arrays import Array
 from gyrostab.diagnose.evidence.held_out import LinearModel, linear_model_factors
 from gyrostab.diagnose.evidence.mixture import Mixture
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.predict.average_sizes import average_sizes
+from gyrostab.diagnose.predict.average_sizes import Size, average_sizes
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
     CandidateEvidence,
@@ -29,8 +29,27 @@ from gyrostab.diagnose.settings import Settings
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Windows
 
-Sizes = Mapping[str, tuple[float, ...]]
-Region = Mapping[str, Any]
+#: Keys are ``name``, or ``name.axis`` for a size of each of several axes.
+Sizes = Mapping[str, Size]
+
+
+class Region(TypedDict):
+    """A place where recording and simulation differ."""
+
+    statistic: str  # name
+    view: str
+    axes: str  # separated by blanks
+    quantity: str  # that is scored, such as "avar", "level", "line" or "outliers"
+    begin: float  # s since the start
+    end: float
+    tau_min_s: float
+    tau_max_s: float
+    frequency: float  # Hz
+    sign: int  # 0 for a mean that wanders
+    z: float
+    p_value: float
+    ratio: float  # observed over expected; for means and restarts the number of standard deviations
+    estimate: float  # depends on the statistic
 
 
 class NullDraw(NamedTuple):
@@ -57,7 +76,7 @@ class SizeFit:
     state: State  # with all other effects in the model
     #: All that were tried; they have the grids of nuisance parameters.
     candidates: Sequence[Candidate]
-    counts: CountEvidence  # expected sample counts
+    count_evidence: CountEvidence  # expected sample counts
     #: Filled by an estimate that averages over a grid: the values at its likeliest point.
     likeliest: dict[str, float | str] = field(default_factory=dict)
 
@@ -79,35 +98,40 @@ class Statistic:
 
     name: str  # unique
     view: str  # the key ``view`` of its mismatches in diagnosis.json
-    explains: tuple[str, ...] = ()  # kinds of mismatches that an effect in it can explain
-    #: Kinds of mismatches whose score against the baseline with effects contains what an effect in
-    #: this statistic contributes.
-    contained_in: tuple[str, ...] = ()
-    #: As what the rest of an effect is reported that explains too little in this statistic.
-    nuisance_alternative = "~S(f)"
+    #: `view` of each mismatch that an effect in it can explain.
+    explained_views: tuple[str, ...] = ()
+    #: `view` of each mismatch whose score against the baseline with effects contains what an effect
+    #: in this statistic contributes.
+    containing_views: tuple[str, ...] = ()
+    #: Nuisance alternative as which an effect is reported on the axes where it shows in this
+    #: statistic and its size may be zero (`gyrostab.diagnose.result.finish.keep_supported`).
+    unsupported_as = "~S(f)"
     error_shows_in: tuple[str, ...] = ()  # statistics that show an error of the form of an effect
     #: Variable of the null records that the evidence uses; "" to draw noise of the linear model.
     null_variable = ""
-    is_power_weighted = False  # whether the expected powers are its weights
-    is_phase_locked = False  # whether it is locked to the rotation of the tool or to the ramp
-    is_in_baseline = False  # whether the baseline with the effects contains what an effect adds
-    is_in_means = False  # whether effects move the block means,
-    is_linear_in_means = False  # by columns,
-    is_switching = False  # by two levels of free course
-    is_random_bias = False  # by a bias of random course, which no other data predict
-    is_power = False  # whether effects add power,
-    is_pairwise = False  # covariance of two axes,
-    is_rotation = False  # amplitudes at multiples of the rotation,
-    is_transfer = False  # what follows a reference channel,
-    is_line = False  # a spectral line,
-    is_count = False  # anomalous samples
-    has_course = False  # whether designs are by block
-    has_size = True  # whether the size follows from a linear model
-    uses_line_spectra = False  # whether the score is of the spectrum at full resolution
-    is_ratio = False  # whether the score is of a variance divided by the expected one
-    grows_in_time = True  # whether adjacent regions of a mismatch are one
-    is_tried_last = False  # whether an effect in it explains only what nothing else does
-    takes_noise = True  # whether an effect takes a share of the noise of an axis
+    # what an effect does
+    is_in_means = False  # effects move the block means
+    is_linear_in_means = False  # effects move the block means by columns of a linear model
+    is_switching = False  # effects move the block means between two levels of free course
+    is_random_bias = False  # effects add a bias of random course, which no other data predict
+    is_power = False  # effects add power
+    is_pairwise = False  # effects add a covariance of two axes
+    is_rotation = False  # effects add amplitudes at multiples of the rotation
+    is_phase_locked = False  # effects are locked to the rotation of the tool or to the ramp
+    is_transfer = False  # effects add what follows a reference channel
+    is_line = False  # effects add a spectral line
+    is_count = False  # effects cause anomalous samples
+    is_in_baseline = False  # `predict_baseline` includes what an effect adds
+    takes_noise = True  # an effect takes a share of the noise of an axis
+    # how effects are searched and fitted
+    has_course = False  # designs are by block, so that an effect may act in part of the record
+    has_size = True  # the size follows from a linear model
+    is_power_weighted = False  # the expected powers give the weights of the data
+    is_tried_last = False  # an effect explains only what no other statistic does
+    # how mismatches are scored
+    uses_line_spectra = False  # the score is of the spectrum at full resolution
+    is_ratio = False  # the score is of a variance divided by the expected one
+    grows_in_time = True  # adjacent regions of a mismatch are one
 
     def __repr__(self) -> str:
         return f"<{self.name}>"
@@ -134,7 +158,7 @@ class Statistic:
 
     # ---------------------------------------------------------------------- candidates
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield what an effect does to the statistic; by default nothing."""
         yield from ()
 
@@ -148,7 +172,7 @@ class Statistic:
     ) -> list[Candidate]:
         """Return the candidates of an effect that follows these channels."""
         variants = distinct_variants(
-            [variant for case in prospects for variant in self.design(case)]
+            [variant for prospect in prospects for variant in self.design(prospect)]
         )
         if not variants:
             return []
@@ -185,12 +209,9 @@ class Statistic:
         rows = self.rows(group[0], trial.state)
         if not rows:  # pairs of a single axis
             return []
-        factors = []
-        spread = 1
-        for row in range(len(rows)):
-            factors.append(self.row_factors(group, row, trial)[:, 1:])
-            spread = factors[-1].shape[1] // sum(len(candidate.variants) for candidate in group)
-        return collect_evidence(group, rows, factors, spread)
+        factors = [self.row_factors(group, row, trial)[:, 1:] for row in range(len(rows))]
+        variant_count = sum(len(candidate.variants) for candidate in group)
+        return collect_evidence(group, rows, factors, factors[-1].shape[1] // variant_count)
 
     def row_factors(self, group: Sequence[Candidate], row: int, trial: Trial) -> Array:
         """Return the factors of all variants in one row, as `linear_model_factors` does."""
@@ -234,12 +255,12 @@ class Statistic:
         return state
 
     def noise_shares(
-        self, component: Component, axis: str, state: State, weight: Array
+        self, component: Component, axis: str, state: State, expected_power: Array
     ) -> tuple[Array | float, list[Array], list[Array]]:
         """Return what a component takes from the noise of an axis.
 
         These are a power of known size (block, band), and powers and means of free size. The state
-        is that without any effect, `weight` (axis, block, band) the powers with all effects.
+        is that without any effect, `expected_power` (axis, block, band) that with all effects.
         """
         if not self.takes_noise:
             return 0.0, [], []
@@ -265,30 +286,27 @@ class Statistic:
         return linear_mixture(component, state, variant)
 
     def estimate(self, fit: SizeFit) -> Sizes:
-        """Estimate parameters with their standard errors; by axis if there are several.
-
-        Keys are ``name`` or ``name.axis``; an asymmetric 95 % interval has its ends behind.
-        """
-        out: dict[str, tuple[float, ...]] = {}
+        """Estimate parameters with their standard errors; by axis if there are several."""
+        out: dict[str, Size] = {}
         points: list[dict[str, float | str]] = []
         # of a parameter that the axes share, the value on the strongest comes last and stays
         for component in sorted(fit.components, key=lambda component: component.evidence_nats):
             if component.variant.columns[:1] == ("any",):
                 continue
-            mean, covariance, ends, nuisance, (best, variant) = average_sizes(
-                component, fit.state, fit.candidates
-            )
+            averaged = average_sizes(component, fit.state, fit.candidates)
             for number, name in enumerate(component.variant.columns):
-                value, sd = float(mean[number]), float(np.sqrt(covariance[number, number]))
-                size: tuple[float, ...] = (value, sd, *ends[:, number].tolist())
-                likeliest = float(best[number])
+                value = float(averaged.mean[number])
+                sd = float(np.sqrt(averaged.covariance[number, number]))
+                ends = averaged.ends[:, number]
+                size: Size = (value, sd, *ends.tolist())
+                likeliest = float(averaged.likeliest_sizes[number])
                 if component.variant.squared:
-                    size = (*_square_root(value, sd), *np.sqrt(np.maximum(ends[:, number], 0.0)))
+                    size = (*_square_root(value, sd), *np.sqrt(np.maximum(ends, 0.0)))
                     likeliest = float(np.sqrt(max(likeliest, 0.0)))
                 key = name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"
                 out[key], fit.likeliest[key] = size, likeliest
-            out |= nuisance
-            points.append(dict(variant.values))
+            out |= averaged.nuisance
+            points.append(dict(averaged.likeliest_variant.values))
         if all(point == points[0] for point in points):
             fit.likeliest.update(points[0] if points else {})
         else:  # axes that differ in a common parameter
@@ -301,7 +319,7 @@ class Statistic:
         self, component: Component, region: Region, blocks: xr.Dataset, settings: Settings
     ) -> bool:
         """Return whether a component of an effect can show in a mismatch."""
-        return str(region["view"]) in self.explains
+        return region["view"] in self.explained_views
 
     def is_modelled_in(self, region: Region, *, together: bool) -> bool:
         """Return whether the baseline with the effects contains what an effect does to a mismatch.
@@ -314,8 +332,11 @@ class Statistic:
         """Return the averaging times [s] at which a component shows; by default within a block."""
         return 1.0 / float(blocks.attrs["sampling_rate_hz"]), float(blocks.attrs["block_s"])
 
-    def describe(self, region: Region, when: str) -> str:
-        """Describe a mismatch in a sentence without its full stop; `when` is its time."""
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
+        """Describe a mismatch in a sentence without its full stop; `when` is its time.
+
+        The mismatch is a `Region`, but with a list of axes.
+        """
         raise NotImplementedError(f"{self.name} locates no mismatches")
 
 

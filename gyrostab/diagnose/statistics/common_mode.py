@@ -13,15 +13,15 @@ from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.cross_spectrum import correlation_score
 from gyrostab.diagnose.statistics.mean import slow_coefficients
+from gyrostab.diagnose.statistics.mismatch_wording import capitalise_axes, taus_text
 from gyrostab.diagnose.statistics.scores import (
-    Windows,
+    BlockWindows,
     cube_root_score,
     moving_sum,
     statistic_dataset,
     sum_over_windows,
     window_set,
 )
-from gyrostab.diagnose.statistics.wording import subject, taus_text
 from gyrostab.kernels.regression.state_space import flicker_states, whiten
 from gyrostab.units import HOUR
 
@@ -90,7 +90,7 @@ class CommonMode(Statistic):
             rows=rows,
             windows=windows,
             columns={
-                "what": "slow",
+                "quantity": "slow",
                 "tau_min_s": block * np.array(spans, dtype=float),
                 "tau_max_s": block * block_count / 2.0,
             },
@@ -101,8 +101,9 @@ class CommonMode(Statistic):
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
         return (
-            f"{subject(region)} drift together (correlation {region['estimate']:.2g}) {when}, at "
-            f"{taus_text(region)}, which the random walks of independent gyros do not"
+            f"{capitalise_axes(region['axes'])} drift together (correlation "
+            f"{region['estimate']:.2g}) {when}, at {taus_text(region)}, which the random walks of "
+            "independent gyros do not"
         )
 
 
@@ -157,7 +158,7 @@ def _correlate_pairs(
     increments: Floats,
     present: Bools,
     pairs: Pairs,
-    windows: Windows,
+    windows: BlockWindows,
     span: int,
     shared: tuple[Floats, Floats] | None,
 ) -> tuple[Floats, Floats]:

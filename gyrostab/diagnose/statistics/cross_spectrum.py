@@ -32,18 +32,18 @@ from gyrostab.diagnose.predict.linear_model import (
     unspread_share,
     variant_designs,
 )
-from gyrostab.diagnose.reduce.block_statistics import pair_indices
+from gyrostab.diagnose.reduce.schema import pair_indices
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
+from gyrostab.diagnose.statistics.mismatch_wording import capitalise_axes, taus_text
 from gyrostab.diagnose.statistics.power import with_axis
 from gyrostab.diagnose.statistics.scores import (
-    Windows,
+    BlockWindows,
     cube_root_score,
     statistic_dataset,
     sum_over_windows,
     window_set,
 )
 from gyrostab.diagnose.statistics.shared_factors import estimate_shared_factors
-from gyrostab.diagnose.statistics.wording import subject, taus_text
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (5, 15, 45)
@@ -58,9 +58,9 @@ class CrossSpectrum(Statistic):
 
     name = "cross_spectrum"
     view = "cross_axis"
-    explains = ("cross_axis", "davar")
-    contained_in = ("davar", "cross_axis")
-    nuisance_alternative = "~cov"
+    explained_views = ("cross_axis", "davar")
+    containing_views = ("davar", "cross_axis")
+    unsupported_as = "~cov"
     error_shows_in = ("cross_spectrum",)
     null_variable = "cross"
     is_power_weighted = True
@@ -109,7 +109,7 @@ class CrossSpectrum(Statistic):
             rows=rows,
             windows=windows,
             columns={
-                "what": np.repeat(
+                "quantity": np.repeat(
                     ["in phase", "all in phase", "in quadrature", "all in quadrature"],
                     [bands, 1, bands, 1],
                 ),
@@ -122,13 +122,13 @@ class CrossSpectrum(Statistic):
             estimate=r,
         )
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield cross-densities per product of the factors of both axes."""
-        prediction = case.prediction
+        prediction = prospect.prediction
         if not prediction.coherent or prediction.line is not None:
             return
         for name, density in prediction.spectrum.items():
-            yield Variant(case.values, (name,), with_axis(density)[None], squared=True)
+            yield Variant(prospect.values, (name,), with_axis(density)[None], squared=True)
 
     def rows(self, candidate: Candidate, state: State) -> list[tuple[str, ...]]:
         return pair_rows(state.blocks)
@@ -143,7 +143,8 @@ class CrossSpectrum(Statistic):
         values = records_last(data["cross"].values, 3)[row] - shared[..., None]
         shape = state.blocks["cross_shape"].values[row]
         # The scatter is larger in phase with shared noise, and smaller in quadrature.
-        noise_product, shared_product = state.weight[i] * state.weight[j], (shared**2).real
+        noise_product = state.expected_power[i] * state.expected_power[j]
+        shared_product = (shared**2).real
         in_quadrature = np.maximum(
             noise_product - shared_product, _MIN_QUADRATURE_SHARE * noise_product
         )
@@ -195,14 +196,14 @@ class CrossSpectrum(Statistic):
         estimate = region.get("estimate", np.nan)
         size = f" (coherency {estimate:.2g})" if np.isfinite(estimate) else ""
         return (
-            f"{subject(region)} vary together{size} {when}, at {taus_text(region)}, which "
-            "independent gyros do not"
+            f"{capitalise_axes(region['axes'])} vary together{size} {when}, at "
+            f"{taus_text(region)}, which independent gyros do not"
         )
 
 
 @np.errstate(divide="ignore", invalid="ignore")
 def _pair_coherency(
-    blocks: xr.Dataset, baseline: xr.Dataset, left: Ints, right: Ints, windows: Windows
+    blocks: xr.Dataset, baseline: xr.Dataset, left: Ints, right: Ints, windows: BlockWindows
 ) -> tuple[Complexes, Floats]:
     """Compute the coherency and the number of complex frequencies by (record), pair, window, band.
 

@@ -12,16 +12,16 @@ from scipy.special import log_ndtr
 from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
 from gyrostab.diagnose.statistics.base import Statistic
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
-    Windows,
+    BlockWindows,
     cube_root_score,
     cumulative,
     exponential_score,
     part_windows,
     statistic_dataset,
 )
-from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.kernels.spectra.line_levels import local_level
 
 _SPECTRUM_SECTIONS = 8  # in which paths begin and end; design choice
@@ -88,7 +88,7 @@ class DriftingLine(Statistic):
         return statistic_dataset(
             blocks,
             rows=axes,
-            windows=Windows(first[parts[:1]], stop[parts[-1:]]),
+            windows=BlockWindows(first[parts[:1]], stop[parts[-1:]]),
             columns=_path_columns(blocks["line_frequency"].values),
             z=z[..., None, :],
             ratio=np.where(path_count > 0, largest, np.nan)[..., None, :],
@@ -96,7 +96,7 @@ class DriftingLine(Statistic):
         )
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        first, last = region["what"].split()[1:]
+        first, last = region["quantity"].split()[1:]
         return (
             f"The spectrum of {axes_text(region['axes'])} has a drifting line {when}, from about "
             f"{first} Hz to about {last} Hz"
@@ -181,7 +181,7 @@ def _path_columns(frequency: Floats) -> dict[str, Any]:
     middle = (edges[1:] + edges[:-1]) / 2.0
     begin_section, end_section = np.divmod(np.arange(_SPECTRUM_SECTIONS**2), _SPECTRUM_SECTIONS)
     return {
-        "what": [
+        "quantity": [
             f"drifting {middle[a]:.3g} {middle[b]:.3g}"
             for a, b in zip(begin_section, end_section, strict=True)
         ],

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -35,13 +35,13 @@ from gyrostab.diagnose.statistics.jump_forms import (
     restart_competitors,
     scatter_competitors,
 )
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text, is_higher
 from gyrostab.diagnose.statistics.scores import (
-    Windows,
+    BlockWindows,
     statistic_dataset,
     sum_over_windows,
     window_set,
 )
-from gyrostab.diagnose.statistics.wording import axes_text, is_higher
 from gyrostab.kernels.regression.boxcars import (
     boxcar_information,
     filter_gains,
@@ -51,7 +51,7 @@ from gyrostab.kernels.regression.boxcars import (
 from gyrostab.kernels.regression.state_space import flicker_states
 from gyrostab.kernels.spectra.expected import interval_variance
 from gyrostab.physics.base import Effect
-from gyrostab.physics.prediction import Windows as PredictionWindows
+from gyrostab.physics.prediction import Windows
 from gyrostab.units import HOUR
 
 #: Lengths of the windows [blocks].
@@ -72,7 +72,7 @@ class BlockMeanStatistic(Statistic):
     """What statistics of effects in the block means share."""
 
     view = "mean"
-    explains: tuple[str, ...] = (
+    explained_views: tuple[str, ...] = (
         "mean",
         "restart",
         "davar",
@@ -80,8 +80,8 @@ class BlockMeanStatistic(Statistic):
         "cross_axis",
         "spectrum",
     )
-    contained_in: tuple[str, ...] = ("davar", "mean", "restart", "cross_axis")
-    nuisance_alternative = "~bias(t)"
+    containing_views: tuple[str, ...] = ("davar", "mean", "restart", "cross_axis")
+    unsupported_as = "~bias(t)"
     error_shows_in = ("mean",)
     is_in_baseline = True
 
@@ -102,8 +102,8 @@ class BlockMeanStatistic(Statistic):
         self, component: Component, region: Region, blocks: xr.Dataset, settings: Settings
     ) -> bool:
         """Return whether the mismatch is one of means; of several axes only a slow one."""
-        is_slow = region["view"] != "cross_axis" or region["what"] == "slow"
-        return str(region["view"]) in self.explains and bool(is_slow)
+        is_slow = region["view"] != "cross_axis" or region["quantity"] == "slow"
+        return region["view"] in self.explained_views and bool(is_slow)
 
     def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
         return float(blocks.attrs["block_s"]), float(blocks["end"].values[-1]) / 2.0
@@ -152,7 +152,7 @@ class Mean(BlockMeanStatistic):
             blocks,
             windows=windows,
             columns={
-                "what": "mean",
+                "quantity": "mean",
                 "tau_min_s": [block],
                 "tau_max_s": [block * max(windows.length, default=1)],
             },
@@ -161,19 +161,19 @@ class Mean(BlockMeanStatistic):
             estimate=estimate,
         )
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield designs of the mean that are not constant; the constant is free."""
         columns = {}
-        for name, design in case.prediction.mean.items():
+        for name, design in prospect.prediction.mean.items():
             moved = design - design.mean(axis=-1, keepdims=True)
             if np.isfinite(moved).all() and np.abs(moved).max() > 1e-9 * np.abs(design).max(
                 initial=1e-300
             ):
                 columns[name] = design
-        yield from choose_columns(case.values, columns)
+        yield from choose_columns(prospect.values, columns)
 
     def complete_candidate(
-        self, candidate: Candidate, kind: type[Effect], windows: PredictionWindows
+        self, candidate: Candidate, kind: type[Effect], windows: Windows
     ) -> Candidate:
         """Let a step at a given time occur at every restart."""
         return replace(candidate, variants=_with_steps_at_restarts(candidate.variants, windows))
@@ -196,7 +196,7 @@ class Mean(BlockMeanStatistic):
         )
         return trial.recall(compute, group, *mean_inputs(trial, axis))
 
-    def describe(self, region: Region, when: str) -> str:
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
         axes, estimate = axes_text(region["axes"]), region.get("estimate", np.nan)
         if region.get("sign", 1) == 0:
             return (
@@ -224,9 +224,7 @@ def mean_inputs(trial: Trial, axis: str) -> list[Floats | None]:
     ]
 
 
-def _with_steps_at_restarts(
-    variants: tuple[Variant, ...], windows: PredictionWindows
-) -> tuple[Variant, ...]:
+def _with_steps_at_restarts(variants: tuple[Variant, ...], windows: Windows) -> tuple[Variant, ...]:
     """Add a variant in which the level changes at every restart, each time by another size.
 
     A single step leaves the others, which free random walk explains as well as that step. With all
@@ -260,7 +258,7 @@ def _with_steps_at_restarts(
 
 
 def window_means(
-    blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
+    blocks: xr.Dataset, baseline: xr.Dataset, windows: BlockWindows
 ) -> tuple[Floats, Floats]:
     """Compute matched filter and information of every window; their ratio is the constant in it.
 
@@ -277,7 +275,9 @@ def window_means(
     return amount, information
 
 
-def _matched_filter(residual: Floats, noise: MeanNoise, windows: Windows) -> tuple[Floats, Floats]:
+def _matched_filter(
+    residual: Floats, noise: MeanNoise, windows: BlockWindows
+) -> tuple[Floats, Floats]:
     """Return filter output and information of each window, both independent of a constant."""
     weighted = apply_precision(residual, noise)
     weighted_ones = apply_precision(np.ones(residual.shape[-1]), noise)
@@ -332,7 +332,7 @@ def apply_precision(series: Floats, noise: MeanNoise) -> Floats:
     return np.asarray(out.reshape(series.shape))
 
 
-def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Floats) -> float:
+def region_mean(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, inside: Bools) -> float:
     """Return the constant added only in some blocks of a recording [degree hour-1].
 
     By generalised least squares with a constant of the record.
@@ -356,5 +356,5 @@ def _moving_blocks(state: State, row: int, columns: list[Floats]) -> Bools:
     size, *_ = np.linalg.lstsq(design[good], y[good], rcond=None)
     curve = design @ size
     mask = np.zeros_like(state.masked)
-    mask[row] = moves_within_blocks(curve, state.weight[row, :, 0], blocks, state.settings)
+    mask[row] = moves_within_blocks(curve, state.expected_power[row, :, 0], blocks, state.settings)
     return mask

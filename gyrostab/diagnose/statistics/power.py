@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -37,9 +38,9 @@ from gyrostab.diagnose.predict.windows import hat_functions
 from gyrostab.diagnose.reduce.accumulate import RECORD_PARTS
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
-from gyrostab.diagnose.statistics.base import Competitor, Region, Statistic, choose_columns
+from gyrostab.diagnose.statistics.base import Competitor, Statistic, choose_columns
+from gyrostab.diagnose.statistics.mismatch_wording import capitalise_axes, is_higher, taus_text
 from gyrostab.diagnose.statistics.scores import cube_root_score, statistic_dataset
-from gyrostab.diagnose.statistics.wording import is_higher, subject, taus_text
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.registry import effects
 
@@ -53,9 +54,9 @@ class Power(Statistic):
 
     name = "power"
     view = "davar"
-    explains = ("davar", "spectrum", "distribution")
-    contained_in = ("davar", "distribution")
-    nuisance_alternative = "~N(t)"
+    explained_views = ("davar", "spectrum", "distribution")
+    containing_views = ("davar", "distribution")
+    unsupported_as = "~N(t)"
     error_shows_in = ("power",)
     null_variable = "power"
     is_power_weighted = True
@@ -96,19 +97,19 @@ class Power(Statistic):
             ratio=ratio,
         )
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield added densities; for a filter what it adds or removes at its full size.
 
         Constant coherent densities are left to the cross-spectra.
         """
-        frequency = case.blocks["frequency"].values
-        rate = float(case.blocks.attrs["sampling_rate_hz"])
+        frequency = prospect.blocks["frequency"].values
+        rate = float(prospect.blocks.attrs["sampling_rate_hz"])
         level: dict[str, Floats] = {}
-        for (symbol, name), share in case.prediction.level.items():
+        for (symbol, name), share in prospect.prediction.level.items():
             square = (
-                case.coefficient.sel(term=symbol).values ** 2
-                if symbol in case.coefficient["term"].values
-                else np.zeros(case.coefficient.sizes["axis"])
+                prospect.coefficient.sel(term=symbol).values ** 2
+                if symbol in prospect.coefficient["term"].values
+                else np.zeros(prospect.coefficient.sizes["axis"])
             )
             component = (
                 np.atleast_2d(share)[..., None]
@@ -117,12 +118,12 @@ class Power(Statistic):
             )
             level[name] = level.get(name, 0.0) + component
         spectrum = {}
-        if case.prediction.line is None:
+        if prospect.prediction.line is None:
             spectrum = {
                 name: with_axis(density)
-                for name, density in case.prediction.spectrum.items()
-                if (_changes_over_time(density) or not case.prediction.coherent)
-                and not is_correlated_bias(name, case.prediction, case.blocks)
+                for name, density in prospect.prediction.spectrum.items()
+                if (_changes_over_time(density) or not prospect.prediction.coherent)
+                and not is_correlated_bias(name, prospect.prediction, prospect.blocks)
             }
         for columns, squared in ((level, False), (spectrum, True)):
             densities = {
@@ -130,11 +131,11 @@ class Power(Statistic):
                 for name, density in columns.items()
                 if np.abs(density).max(initial=0.0) > 0 and not _is_white_and_constant(density)
             }
-            yield from choose_columns(case.values, densities, squared=squared)
-        response = case.prediction.response
+            yield from choose_columns(prospect.values, densities, squared=squared)
+        response = prospect.prediction.response
         if response:  # on noise as it was logged, whose N contains the aliases
-            change = _filter_change(response["N"], case.coefficient, frequency, rate)
-            yield Variant(case.values, (), change[None])
+            change = _filter_change(response["N"], prospect.coefficient, frequency, rate)
+            yield Variant(prospect.values, (), change[None])
 
     def model(
         self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
@@ -142,7 +143,7 @@ class Power(Statistic):
         axis = state.axes[row]
         expected = axis_values(state.baseline, "spectrum", axis)
         values = records_last(data["power"].values, 3)[row] - expected[..., None]
-        weight = axis_values(state.baseline, "shape_alone", axis) / state.weight[row] ** 2
+        weight = axis_values(state.baseline, "shape_alone", axis) / state.expected_power[row] ** 2
         weight = np.where(state.masked[row][:, None], 0.0, weight)
         level, precision, low = noise_columns(state.baseline, axis=axis)
         unspread, width = unspread_share(state.blocks)[row], band_widths(state.blocks)
@@ -153,7 +154,7 @@ class Power(Statistic):
                 candidates, lambda density: mix_with_mean(select_row(density, row), unspread, width)
             ),
             state.power_columns(axis),
-            known=[level[..., number] * expected for number in range(level.shape[2])],
+            noise_columns=[level[..., number] * expected for number in range(level.shape[2])],
             precision=np.diagonal(precision),
             is_bounded=[
                 variant.squared for candidate in candidates for variant in candidate.variants
@@ -161,7 +162,7 @@ class Power(Statistic):
             low=[*low, *state.least_powers(axis)],
         )
         common = axis_values(state.baseline, "common", axis)
-        return with_independent_cells(model, common, state.weight[row])
+        return with_independent_cells(model, common, state.expected_power[row])
 
     def is_filter(self, variant: Variant) -> bool:
         """Return whether a variant has no size: what a filter does at its full size."""
@@ -186,10 +187,10 @@ class Power(Statistic):
             [power_column(density, row, state) for density in component.variant.design],
         )
 
-    def describe(self, region: Region, when: str) -> str:
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
         is_single = len(region["axes"]) == 1
         return (
-            f"{subject(region)} {'is' if is_single else 'are'} "
+            f"{capitalise_axes(region['axes'])} {'is' if is_single else 'are'} "
             f"{'noisier' if is_higher(region) else 'quieter'} than the simulation {when}: "
             f"at {taus_text(region)} {'its' if is_single else 'their'} Allan variance is "
             f"{region['ratio']:.3g} times the expected value"
@@ -233,7 +234,7 @@ def parts_of_record(component: Component, state: State) -> Iterator[Competitor]:
     """
     if not effects()[component.candidate.effect].is_steady:
         return
-    state = replace(state, weight=condition_on(state, [component]).weight)
+    state = replace(state, expected_power=condition_on(state, [component]).expected_power)
     size, error = np.array(
         [
             _fit_part(component, state, inside)

@@ -21,16 +21,16 @@ from gyrostab.diagnose.predict.linear_model import (
 )
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.statistics.base import NullDraw, Statistic, choose_columns
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.diagnose.statistics.rotation_order import score_orders, turns_per_second
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
-    Windows,
+    BlockWindows,
     cube_root_score,
     statistic_dataset,
     sum_over_windows,
     window_set,
 )
-from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES
 from gyrostab.physics.phase import fold
 
@@ -43,8 +43,8 @@ class RampPhase(Statistic):
 
     name = "ramp_phase"
     view = "spectrum"
-    explains = ("spectrum", "davar", "distribution", "mean")
-    contained_in = ("davar",)
+    explained_views = ("spectrum", "davar", "distribution", "mean")
+    containing_views = ("davar",)
     error_shows_in = ("ramp_phase",)
     is_power_weighted = True
     is_phase_locked = True
@@ -97,23 +97,23 @@ class RampPhase(Statistic):
         return statistic_dataset(
             blocks,
             windows=windows,
-            columns={"what": kinds, "tau_min_s": tau_min, "tau_max_s": tau_max},
+            columns={"quantity": kinds, "tau_min_s": tau_min, "tau_max_s": tau_max},
             z=z,
             ratio=ratio,
             estimate=estimate,
             one_sided=True,
         )
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield profiles that change over the phase."""
-        if "profile" not in case.blocks:
+        if "profile" not in prospect.blocks:
             return
         profiles = {
             name: design
-            for name, design in case.prediction.phase_locked.items()
+            for name, design in prospect.prediction.phase_locked.items()
             if np.isfinite(design).all() and np.ptp(design) > 0
         }
-        yield from choose_columns(case.values, profiles)
+        yield from choose_columns(prospect.values, profiles)
 
     def model(
         self, candidates: Sequence[Candidate], row: int, data: xr.Dataset, state: State
@@ -121,7 +121,7 @@ class RampPhase(Statistic):
         values = records_last(data["profile"].values, 3)[row]
         rate = float(state.blocks.attrs["sampling_rate_hz"])
         width = (state.blocks["band_high"] - state.blocks["band_low"]).values
-        variance = rate * (state.weight[row] * width).sum(axis=-1) / width.sum()
+        variance = rate * (state.expected_power[row] * width).sum(axis=-1) / width.sum()
         weight = state.blocks["profile_samples"].values[row] / variance[:, None]
         given = [np.ones(weight.shape[1]), *state.given.get(("phase_locked", state.axes[row]), [])]
         return linear_model(values, weight, variant_designs(candidates), given)
@@ -133,11 +133,12 @@ class RampPhase(Statistic):
         return free_shape(state, component.row[0])
 
     def noise_shares(
-        self, component: Component, axis: str, state: State, weight: Floats
+        self, component: Component, axis: str, state: State, expected_power: Floats
     ) -> tuple[Floats | float, list[Floats], list[Floats]]:
         """Return the power of the aliased lines of the profile."""
         blocks = state.blocks
-        mean, _ = component_mixture(component, replace(state, weight=weight)).moments()
+        state = replace(state, expected_power=expected_power)
+        mean, _ = component_mixture(component, state).moments()
         profile = np.tensordot(mean, component.variant.design, axes=1)
         square = np.abs(np.fft.rfft(profile)[1:] / profile.size) ** 2
         turns, rate = np.abs(blocks["ramp_turns"].values), float(blocks.attrs["sampling_rate_hz"])
@@ -152,7 +153,7 @@ class RampPhase(Statistic):
         return out, [], []
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        kind = str(region["what"])
+        kind = region["quantity"]
         component = (
             f"The rate of {axes_text(region['axes'])} has a component of "
             f"{region['estimate']:.3g} deg/h"
@@ -165,7 +166,7 @@ class RampPhase(Statistic):
 
 
 def _score_profile(
-    blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows
+    blocks: xr.Dataset, baseline: xr.Dataset, windows: BlockWindows
 ) -> tuple[Floats, ...]:
     """Return score, ratio and rms of the mean by phase, by (record), axis, window, 1."""
     profile = blocks["profile"].values

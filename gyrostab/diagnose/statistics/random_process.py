@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -16,7 +15,7 @@ from gyrostab.diagnose.baseline.posterior import visible_coefficients
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.held_out import Tier, mean_factors, mean_residual
 from gyrostab.diagnose.evidence.wandering import expected_processes, with_process
-from gyrostab.diagnose.predict.average_sizes import plain_places
+from gyrostab.diagnose.predict.average_sizes import Size, plain_places
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
     CandidateEvidence,
@@ -27,7 +26,7 @@ from gyrostab.diagnose.predict.candidates import (
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import Trial
 from gyrostab.diagnose.settings import Settings
-from gyrostab.diagnose.statistics.base import SizeFit, Sizes
+from gyrostab.diagnose.statistics.base import Region, SizeFit, Sizes
 from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, mean_inputs
 from gyrostab.units import HOUR
 
@@ -46,20 +45,20 @@ class RandomProcess(BlockMeanStatistic):
     """
 
     name = "random_process"
-    explains = ("mean", "davar", "restart", "cross_axis")
-    contained_in = ()
-    nuisance_alternative = "~red"
+    explained_views = ("mean", "davar", "restart", "cross_axis")
+    containing_views = ()
+    unsupported_as = "~red"
     null_variable = "mean"
     error_shows_in = ("random_process",)
     has_course = True
     has_size = False
     takes_noise = False
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield random walks whose strength changes in time."""
-        for name, (time, variance) in case.prediction.wander.items():
+        for name, (time, variance) in prospect.prediction.wander.items():
             if np.isinf(time) and np.ptp(variance) > 0.0:
-                yield Variant(case.values, (name,), np.asarray(variance)[None], squared=True)
+                yield Variant(prospect.values, (name,), np.asarray(variance)[None], squared=True)
 
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
         """Return a steady random walk beyond that of the calibration."""
@@ -112,14 +111,14 @@ class RandomProcess(BlockMeanStatistic):
 
     def estimate(self, fit: SizeFit) -> Sizes:
         """Estimate the size of a random walk that follows a channel, for its best exponent."""
-        out: dict[str, tuple[float, ...]] = {}
+        out: dict[str, Size] = {}
         for component in fit.components:
             (name,) = component.variant.columns
             key = name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"
             out[key] = _walk_size(component, fit.state, component.variant)
         return out
 
-    def is_modelled_in(self, region: Mapping[str, Any], *, together: bool) -> bool:
+    def is_modelled_in(self, region: Region, *, together: bool) -> bool:
         """Return whether the baseline contains it: axes that wander together are in no model."""
         return not together
 

@@ -11,8 +11,8 @@ import xarray as xr
 from gyrostab.arrays import Floats
 from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.mean import MeanNoise, apply_precision, mean_noise
-from gyrostab.diagnose.statistics.scores import Windows, statistic_dataset
-from gyrostab.diagnose.statistics.wording import axes_text
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text
+from gyrostab.diagnose.statistics.scores import BlockWindows, statistic_dataset
 
 _DECAY_BLOCKS = (2, 6, 18)  # in which a transient falls to 1/e; design choice
 _SIDE_BLOCKS = 15  # before and after a restart, that are compared; design choice
@@ -57,7 +57,7 @@ class Restart(Statistic):
         return statistic_dataset(
             blocks,
             windows=windows,
-            columns={"what": kinds, "tau_min_s": block, "tau_max_s": tau},
+            columns={"quantity": kinds, "tau_min_s": block, "tau_max_s": tau},
             z=scores,
             ratio=np.abs(scores),
             estimate=size,
@@ -78,7 +78,7 @@ def _restart_blocks(blocks: xr.Dataset) -> np.ndarray:
     return np.unique(first_blocks[(first_blocks > 0) & (first_blocks < blocks.sizes["block"])])
 
 
-def _restart_designs(restarts: np.ndarray, block_count: int) -> tuple[Floats, Windows]:
+def _restart_designs(restarts: np.ndarray, block_count: int) -> tuple[Floats, BlockWindows]:
     """Return the designs of all transients and jumps, and their windows."""
     age = np.full(block_count, np.inf)
     for start in restarts:
@@ -93,7 +93,9 @@ def _restart_designs(restarts: np.ndarray, block_count: int) -> tuple[Floats, Wi
         rows.append(row)
         first.append(int(start))
         stop.append(int(high))
-    return np.array(rows), Windows(np.array(first, dtype=np.int64), np.array(stop, dtype=np.int64))
+    return np.array(rows), BlockWindows(
+        np.array(first, dtype=np.int64), np.array(stop, dtype=np.int64)
+    )
 
 
 def _matched_filter(residual: Floats, designs: Floats, noise: MeanNoise) -> tuple[Floats, Floats]:

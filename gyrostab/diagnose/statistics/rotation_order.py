@@ -12,6 +12,7 @@ import xarray as xr
 from gyrostab.arrays import Array, Bools
 from gyrostab.diagnose.evidence.held_out import LinearModel
 from gyrostab.diagnose.evidence.spectral_lines import interpolate_bands
+from gyrostab.diagnose.predict.average_sizes import Size
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Prospect, Variant
 from gyrostab.diagnose.predict.condition import free_covariance
 from gyrostab.diagnose.predict.linear_model import (
@@ -21,12 +22,12 @@ from gyrostab.diagnose.predict.linear_model import (
     records_last,
 )
 from gyrostab.diagnose.predict.sizes import component_mixture
-from gyrostab.diagnose.reduce.block_statistics import noise_at_orders
+from gyrostab.diagnose.reduce.rotation_orders import noise_at_orders
 from gyrostab.diagnose.statistics.base import NullDraw, SizeFit, Sizes, Statistic
-from gyrostab.diagnose.statistics.scores import Windows, exponential_score, sum_over_windows
+from gyrostab.diagnose.statistics.scores import BlockWindows, exponential_score, sum_over_windows
 from gyrostab.noise import NORMAL_95
 from gyrostab.physics.base import Effect
-from gyrostab.physics.prediction import Windows as EffectWindows
+from gyrostab.physics.prediction import Windows
 
 EARTH_RATE = 15.041067  # deg/h: 360 degrees in a sidereal day of 23.934470 h
 
@@ -39,8 +40,8 @@ class RotationOrder(Statistic):
 
     name = "rotation_order"
     view = "spectrum"
-    explains = ("spectrum", "davar", "mean", "distribution", "cross_axis")
-    contained_in = ("davar",)
+    explained_views = ("spectrum", "davar", "mean", "distribution", "cross_axis")
+    containing_views = ("davar",)
     error_shows_in = ("rotation_order", "power", "cross_spectrum")
     is_power_weighted = True
     is_phase_locked = True
@@ -68,16 +69,16 @@ class RotationOrder(Statistic):
         variance = 2.0 * noise_at_orders(blocks, density) * rate / samples
         return {"order": np.sqrt(variance) * noise}
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield patterns of the harmonics over the axes."""
-        if "order" not in case.blocks:
+        if "order" not in prospect.blocks:
             return
-        count = case.blocks.sizes["harmonic"]
-        for name, pattern in case.prediction.order.items():
-            yield Variant(case.values, (name,), pattern[None, :, :count])
+        count = prospect.blocks.sizes["harmonic"]
+        for name, pattern in prospect.prediction.order.items():
+            yield Variant(prospect.values, (name,), pattern[None, :, :count])
 
     def complete_candidate(
-        self, candidate: Candidate, kind: type[Effect], windows: EffectWindows
+        self, candidate: Candidate, kind: type[Effect], windows: Windows
     ) -> Candidate:
         """Give all axes one size unless the effect has several."""
         many = {item.name for item in kind.parameters() if item.many}
@@ -136,7 +137,7 @@ class RotationOrder(Statistic):
         """
         count = state.blocks.sizes["harmonic"]
         if component.candidate.is_per_axis:
-            chosen = harmonic_sets(count)[component.place]
+            chosen = harmonic_sets(count)[component.line_index]
             patterns = [(axis, np.ones(count, np.complex128)) for axis in component.row]
         else:
             chosen, pattern = (0,), component.variant.design[0]
@@ -166,7 +167,7 @@ class RotationOrder(Statistic):
         For the earth rate these are latitude and toolface of a tool that points down. Angles get
         the error of the form of the amplitude: a share of an angle has no meaning.
         """
-        out: dict[str, tuple[float, ...]] = {}
+        out: dict[str, Size] = {}
         for component in fit.components:
             size, sd, angle = fit_amplitude(component, fit.state)
             error = math.hypot(sd / max(size, 1e-300), fit.state.settings.size_error_share)
@@ -179,7 +180,7 @@ class RotationOrder(Statistic):
             label = "" if len(fit.axes) == 1 else f".{component.row[0]}"
             out |= {f"amplitude{label}": (size, sd), f"phase{label}": (angle, math.degrees(error))}
             harmonics = fit.state.blocks["harmonic"].values
-            out["order"] = (float(harmonics[component.place % harmonics.size]), 0.0)
+            out["order"] = (float(harmonics[component.line_index % harmonics.size]), 0.0)
         return out
 
 
@@ -188,7 +189,7 @@ def is_reversed(component: Component) -> bool:
     return (
         component.statistic.is_rotation
         and not component.candidate.is_per_axis
-        and component.place % 2 == 1
+        and component.line_index % 2 == 1
     )
 
 
@@ -204,7 +205,9 @@ def order_weight(state: State) -> Array:
     )
     nearest = np.abs(np.log(np.maximum(place, frequency[0])[..., None] / frequency)).argmin(axis=-1)
     level = np.take_along_axis(
-        state.weight, np.broadcast_to(nearest, (state.weight.shape[0], *nearest.shape)), axis=2
+        state.expected_power,
+        np.broadcast_to(nearest, (state.expected_power.shape[0], *nearest.shape)),
+        axis=2,
     )
     level = noise_at_orders(blocks, level)
     seconds = blocks["order_samples"].values / rate
@@ -252,7 +255,7 @@ def _visible_bands(density: Array, axis: str, state: State) -> Bools:
     """Find the bands in which an added density (block, band) is visible in the record."""
     row = state.axes.index(axis)
     shape = np.nan_to_num(state.blocks["shape"].values[row])
-    ratio = density / state.weight[row]
+    ratio = density / state.expected_power[row]
     return np.asarray((shape * ratio**2).sum(axis=0) >= state.settings.visible_sigma**2)
 
 
@@ -260,7 +263,7 @@ def _visible_lines(line_power: Array, axis: str, state: State) -> Bools:
     """Find the lines at which an added density (line,) is visible in the record."""
     row, blocks = state.axes.index(axis), state.blocks
     bands, lines = blocks["frequency"].values, blocks["line_frequency"].values
-    noise = interpolate_bands(state.weight[row].mean(axis=0)[None], lines, bands)[0]
+    noise = interpolate_bands(state.expected_power[row].mean(axis=0)[None], lines, bands)[0]
     count = blocks["line_weight"].values[row].sum()
     return np.asarray(line_power / noise * math.sqrt(count) >= state.settings.visible_sigma)
 
@@ -272,7 +275,9 @@ def turns_per_second(blocks: xr.Dataset) -> Array:
     return np.asarray(np.nan_to_num(np.abs(blocks["channel_rotation_rate"].values) / 360.0))
 
 
-def score_orders(blocks: xr.Dataset, baseline: xr.Dataset, windows: Windows) -> tuple[Array, ...]:
+def score_orders(
+    blocks: xr.Dataset, baseline: xr.Dataset, windows: BlockWindows
+) -> tuple[Array, ...]:
     """Return score, ratio and amplitude of the coherent sum by (record), axis, window, harmonic."""
     order = blocks["order"].values
     samples = blocks["order_samples"].values

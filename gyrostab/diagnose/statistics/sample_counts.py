@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -25,6 +26,7 @@ from gyrostab.diagnose.predict.candidates import (
     Component,
     Prospect,
     Variant,
+    is_nuisance,
 )
 from gyrostab.diagnose.predict.condition import free_shape
 from gyrostab.diagnose.predict.linear_model import State, cross_without
@@ -39,15 +41,15 @@ from gyrostab.diagnose.reduce.outliers import (
 from gyrostab.diagnose.reduce.zero_bin import sticking_axes, truncated_axes
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.base import NullDraw, Region, SizeFit, Sizes, Statistic
+from gyrostab.diagnose.statistics.mismatch_wording import capitalise_axes
 from gyrostab.diagnose.statistics.sample_sizes import estimate_from_counts
 from gyrostab.diagnose.statistics.scores import statistic_dataset, sum_over_windows, window_set
-from gyrostab.diagnose.statistics.wording import subject
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (1, 5, 15)
-#: Counts of samples.
-COUNTS = ("outliers", "repeats", "extremes", "zeros")
-_SAMPLES = {
+#: Counts whose mismatches are located.
+SCORED_COUNTS = ("outliers", "repeats", "extremes", "zeros")
+_COUNT_TEXTS = {
     "outliers": "outliers",
     "repeats": "more repeated samples than noise produces",
     "extremes": "many samples at the same smallest or largest value",
@@ -76,9 +78,9 @@ class SampleCounts(Statistic):
 
     name = "sample_counts"
     view = "distribution"
-    explains = ("distribution", "davar", "spectrum", "cross_axis")
-    contained_in = ("davar", "mean", "restart", "cross_axis")
-    nuisance_alternative = "~outliers"
+    explained_views = ("distribution", "davar", "spectrum", "cross_axis")
+    containing_views = ("davar", "mean", "restart", "cross_axis")
+    unsupported_as = "~outliers"
     error_shows_in = ("sample_counts",)
     is_count = True
     has_size = False
@@ -101,11 +103,11 @@ class SampleCounts(Statistic):
         windows = window_set(blocks.sizes["block"], LENGTHS)
         samples = blocks["samples"].values.astype(float)
         counts_by_block = {
-            name: np.nan_to_num(blocks[name].values.astype(float)) for name in COUNTS
+            name: np.nan_to_num(blocks[name].values.astype(float)) for name in SCORED_COUNTS
         }
         counts_by_block["extremes"] = excess_extremes(counts_by_block["extremes"])
         counts = sum_over_windows(
-            np.stack([counts_by_block[name] for name in COUNTS], axis=-1), windows
+            np.stack([counts_by_block[name] for name in SCORED_COUNTS], axis=-1), windows
         )
         tail_score, used = _kurtosis_score(blocks["kurtosis"].values, samples)
         # Rounding has no tails, so that the noise itself may differ from 0.
@@ -122,13 +124,15 @@ class SampleCounts(Statistic):
         rate = float(blocks.attrs["sampling_rate_hz"])
         number = np.concatenate([counts, np.broadcast_to(mean, tails.shape)], axis=-1)
         z = np.concatenate([2.0 * np.sqrt(counts + 0.375), tails], axis=-1)
-        hidden = np.stack([hidden_by_grid(blocks, name) for name in (*COUNTS, "kurtosis")], axis=-1)
+        hidden = np.stack(
+            [hidden_by_grid(blocks, name) for name in (*SCORED_COUNTS, "kurtosis")], axis=-1
+        )
         z = np.where(hidden[:, None, :], np.nan, z)
         return statistic_dataset(
             blocks,
             windows=windows,
             columns={
-                "what": [*COUNTS, "kurtosis"],
+                "quantity": [*SCORED_COUNTS, "kurtosis"],
                 "tau_min_s": 1.0 / rate,
                 "tau_max_s": 1.0 / rate,
                 "floor": _MIN_SCATTER,
@@ -138,13 +142,13 @@ class SampleCounts(Statistic):
             estimate=number,
         )
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield the counts that the effect raises."""
-        if case.prediction.marks:
-            yield Variant(case.values, case.prediction.marks, np.empty(0))
+        if prospect.prediction.marks:
+            yield Variant(prospect.values, prospect.prediction.marks, np.empty(0))
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
-        if trial.counts is None:
+        if trial.count_evidence is None:
             return []
         subsets = fold_subsets(trial.folds)
         rows = self.rows(group[0], trial.state)
@@ -157,7 +161,9 @@ class SampleCounts(Statistic):
                     np.where(
                         hidden_by_grid(trial.state.blocks, name) | (sticks & (name == "repeats")),
                         0.0,
-                        _count_evidence(name, trial.data, trial.state, subsets, trial.counts),
+                        _count_evidence(
+                            name, trial.data, trial.state, subsets, trial.count_evidence
+                        ),
                     )
                     for name in variant.columns
                 ]
@@ -190,7 +196,7 @@ class SampleCounts(Statistic):
             fit.components[0].variant.columns[0],
             fit.components[0].row[0],
             fit.state.blocks,
-            fit.counts,
+            fit.count_evidence,
             fit.state.settings,
         )
 
@@ -198,10 +204,10 @@ class SampleCounts(Statistic):
         """Return whether the mismatch is of several axes: anomalous blocks are left out there."""
         return bool(region["view"] == "cross_axis")
 
-    def describe(self, region: Region, when: str) -> str:
-        samples = _SAMPLES.get(str(region["what"]), "an unusual distribution of its samples")
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
+        samples = _COUNT_TEXTS.get(region["quantity"], "an unusual distribution of its samples")
         verb = "has" if len(region["axes"]) == 1 else "have"
-        return f"{subject(region)} {verb} {samples} {when}"
+        return f"{capitalise_axes(region['axes'])} {verb} {samples} {when}"
 
 
 def _kurtosis_score(excess: Floats, samples: Floats) -> tuple[Floats, Floats]:
@@ -251,9 +257,8 @@ def _count_evidence(
 
 def _is_everywhere(component: Component) -> bool:
     """Return whether the samples are anomalous in all blocks alike."""
-    return (
-        component.candidate.effect == "rate_quantization"
-        or component.candidate.effect.startswith("~")
+    return component.candidate.effect == "rate_quantization" or is_nuisance(
+        component.candidate.effect
     )
 
 

@@ -12,6 +12,7 @@ from scipy.special import gammaincinv, ndtr, ndtri
 
 from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
+from gyrostab.diagnose.predict.average_sizes import Size
 from gyrostab.diagnose.reduce.outliers import outlier_limit
 from gyrostab.diagnose.reduce.schema import axis_values, weighted_mean
 from gyrostab.diagnose.settings import INTERVAL_TAILS, Settings
@@ -34,7 +35,7 @@ def estimate_from_counts(
     blocks: xr.Dataset,
     count_evidence: CountEvidence,
     settings: Settings,
-) -> dict[str, tuple[float, ...]]:
+) -> dict[str, Size]:
     """Estimate the parameters of an effect on the sample distribution."""
     on_axis = blocks.sel(axis=axis)
     samples = max(float(on_axis["samples"].sum()), 1.0)
@@ -45,7 +46,7 @@ def estimate_from_counts(
     row = [str(name) for name in blocks["axis"].values].index(axis)
     usual = float(count_evidence.of[mark][0][row].sum()) if mark in count_evidence.of else 0.0
     if effect == "spikes":
-        count = max(float(on_axis["peaks"].where(on_axis[mark] > 0).sum()), 1.0)
+        count = max(float(on_axis["outlier_count"].where(on_axis[mark] > 0).sum()), 1.0)
         return _size_spikes(count, hours, _estimate_outliers(blocks, axis), settings)
     if effect == "held_samples":
         if not float(on_axis["quantization_step"]) > 0.0:
@@ -163,7 +164,7 @@ def _size_range(blocks: xr.Dataset, spread: float, samples: float) -> tuple[floa
 
 def _size_spikes(
     count: float, hours: float, outliers: tuple[float, float, float] | None, settings: Settings
-) -> dict[str, tuple[float, ...]]:
+) -> dict[str, Size]:
     """Return how often outliers occur, and their size, with intervals of positive quantities.
 
     The number is the count of outliers divided by the share of a normal law that is seen. Their
@@ -251,7 +252,7 @@ def _estimate_outliers(blocks: xr.Dataset, axis: str) -> tuple[float, float, flo
     """
     count, excess, samples = (
         axis_values(blocks, name, axis).astype(np.float64)
-        for name in ("peaks", "kurtosis", "samples")
+        for name in ("outlier_count", "kurtosis", "samples")
     )
     good = (count > 0.0) & np.isfinite(excess) & (excess > 0.0)
     single = good & (count == 1.0)  # several in a block differ in size

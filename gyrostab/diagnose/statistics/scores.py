@@ -18,7 +18,7 @@ _MAX_DENSE_BLOCKS = 1000  # of a record with this step; limits time
 _LONG_WINDOW_STEP = 0.4  # the same for longer records
 
 
-class Windows(NamedTuple):
+class BlockWindows(NamedTuple):
     """Windows of whole blocks: first block of each, and the first one after it."""
 
     first: Ints
@@ -30,15 +30,15 @@ class Windows(NamedTuple):
         return self.stop - self.first
 
 
-def window_set(block_count: int, lengths: Sequence[int], *, whole: bool = True) -> Windows:
+def window_set(block_count: int, lengths: Sequence[int], *, whole: bool = True) -> BlockWindows:
     """Return windows of several lengths [blocks], a fifth of their length apart.
 
     In long records it is two fifths. Lengths above half of the record are skipped.
 
     Examples
     --------
-    >>> dataset = window_set(10, (1, 5))
-    >>> dataset.length.tolist()
+    >>> windows = window_set(10, (1, 5))
+    >>> windows.length.tolist()
     [1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 5, 5, 5, 5, 5, 5, 10]
     """
     first, length = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
@@ -56,15 +56,15 @@ def window_set(block_count: int, lengths: Sequence[int], *, whole: bool = True) 
         first.append(np.zeros(1, np.int64))
         length.append(np.full(1, block_count))
     begin = np.concatenate(first)
-    return Windows(begin, begin + np.concatenate(length))
+    return BlockWindows(begin, begin + np.concatenate(length))
 
 
-def part_windows(blocks: xr.Dataset) -> Windows:
+def part_windows(blocks: xr.Dataset) -> BlockWindows:
     """Return the blocks of the equal parts of the record, and of the whole last."""
     part_count, block_count = blocks.sizes["part"], blocks.sizes["block"]
     # As the blocks were divided when the log was read.
     edge = -(-np.arange(part_count + 1) * block_count // part_count)
-    return Windows(
+    return BlockWindows(
         np.append(edge[:-1], 0), np.append(np.maximum(edge[1:], edge[:-1] + 1), block_count)
     )
 
@@ -86,7 +86,7 @@ def moving_sum(values: Floats, span: int) -> Floats:
     return np.asarray(total[..., span:] - total[..., :-span])
 
 
-def sum_over_windows(values: Any, windows: Windows, *, axis: int = -2) -> Any:
+def sum_over_windows(values: Any, windows: BlockWindows, *, axis: int = -2) -> Any:
     """Sum over each window; missing values must be zero. The blocks are along `axis`.
 
     Examples
@@ -127,7 +127,7 @@ def exponential_score(value: Floats) -> Floats:
 def statistic_dataset(
     blocks: xr.Dataset,
     *,
-    windows: Windows,
+    windows: BlockWindows,
     columns: dict[str, Any],
     z: Floats,
     ratio: Floats,
@@ -138,7 +138,7 @@ def statistic_dataset(
     """Assemble the results of a statistic by (record), row, window, tau.
 
     These are its near-normal score ``z``, the ``ratio`` of observed over expected, and perhaps an
-    ``estimate``, the size of the mismatch. Columns have ``what`` (str), ``tau_min_s``,
+    ``estimate``, the size of the mismatch. Columns have ``quantity`` (str), ``tau_min_s``,
     ``tau_max_s`` [s], ``frequency`` [Hz] and ``floor``, the smallest standard deviation that null
     records may give a score. The rows are axes, separated by blanks; by default each axis of the
     record. Only an excess is a mismatch in a one-sided statistic.

@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from gyrostab.arrays import Bools, Floats
+from gyrostab.diagnose.predict.average_sizes import Size
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State, cross_column, pair_rows
 from gyrostab.diagnose.predict.sizes import component_mixture
@@ -30,7 +31,7 @@ ORDER_ERROR = 0.05  # relative change of the level below a low-pass if it has tw
 
 def estimate_shared_factors(
     components: Sequence[Component], axes: tuple[str, ...], state: State
-) -> dict[str, tuple[float, ...]]:
+) -> dict[str, Size]:
     """Estimate the factor of every axis and the low-pass of the common noise.
 
     The cross-spectra of all pairs weight white noise and low-passes of any bandwidth. No axis has
@@ -56,7 +57,7 @@ def estimate_shared_factors(
     ]
     plain = bool(share[white].sum() >= 0.5)
     is_likelier = white[chosen] == plain
-    sizes: dict[str, tuple[float, ...]] = {
+    sizes: dict[str, Size] = {
         name if len(axes) == 1 else f"{name}.{axis}": _summarise_draws(factor[:, k], is_likelier)
         for k, axis in enumerate(axes)
     }
@@ -147,7 +148,7 @@ def _max_factor(axis: str, variant: Variant, state: State) -> float:
     power, shape = (axis_values(blocks, name, axis) for name in ("power", "shape"))
     weight = (
         np.where(np.isfinite(power) & np.isfinite(shape), shape, 0.0)
-        / state.weight[state.axes.index(axis)] ** 2
+        / state.expected_power[state.axes.index(axis)] ** 2
     )
     return math.sqrt(
         float((weight * design * np.nan_to_num(power)).sum() / (weight * design**2).sum())

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -36,9 +37,10 @@ from gyrostab.diagnose.reduce.block_statistics import MIN_BLOCKS
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.base import Region, SizeFit, Sizes, Statistic
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
-    Windows,
+    BlockWindows,
     cube_root_score,
     cumulative,
     moving_sum,
@@ -46,7 +48,6 @@ from gyrostab.diagnose.statistics.scores import (
     statistic_dataset,
     sum_over_windows,
 )
-from gyrostab.diagnose.statistics.wording import axes_text
 from gyrostab.kernels.spectra.line_levels import LEAK_LINES, local_level
 
 _WIDTH_LINES = 5  # of a line with its leakage
@@ -60,8 +61,8 @@ class SpectralLine(Statistic):
 
     name = "spectral_line"
     view = "spectrum"
-    explains = ("spectrum", "davar", "distribution", "cross_axis")
-    contained_in = ("davar", "cross_axis")
+    explained_views = ("spectrum", "davar", "distribution", "cross_axis")
+    containing_views = ("davar", "cross_axis")
     is_line = True
     has_size = False
     uses_line_spectra = True
@@ -95,22 +96,27 @@ class SpectralLine(Statistic):
         return statistic_dataset(
             blocks,
             windows=windows,
-            columns={"what": "line", "tau_min_s": half, "tau_max_s": half, "frequency": frequency},
+            columns={
+                "quantity": "line",
+                "tau_min_s": half,
+                "tau_max_s": half,
+                "frequency": frequency,
+            },
             z=z,
             ratio=ratio,
             estimate=2.0 * np.sqrt(np.maximum(excess, 0.0) / float(blocks.attrs["block_s"])),
             one_sided=True,
         )
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield a line of constant frequency; the spectrum itself determines the frequency."""
         if (
-            case.prediction.line is None
-            or not case.prediction.coherent
-            or np.ptp(case.prediction.line) > 0
+            prospect.prediction.line is None
+            or not prospect.prediction.coherent
+            or np.ptp(prospect.prediction.line) > 0
         ):
             return
-        yield Variant({}, tuple(case.prediction.spectrum), np.empty(0), squared=True)
+        yield Variant({}, tuple(prospect.prediction.spectrum), np.empty(0), squared=True)
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
         """Compute the evidence of one line on all axes, of any phase or of constant phase.
@@ -138,29 +144,29 @@ class SpectralLine(Statistic):
         ]
 
     def condition(self, state: State, component: Component) -> State:
-        frequency = float(state.blocks["line_frequency"].values[component.place])
+        frequency = float(state.blocks["line_frequency"].values[component.line_index])
         axis = component.row[0]
         power_columns = state.power_columns(axis)
         for band in find_bands(state.blocks, frequency):
-            column = np.zeros(state.weight.shape[1:])
+            column = np.zeros(state.expected_power.shape[1:])
             column[:, band] = 1.0
             if any(np.array_equal(column, other) for other in power_columns):
                 continue  # another line in the same band is already given
             state = state.with_columns("power", axis, [column])
             state = free_covariance(state, (axis,), column)
-        skirt = line_skirt(state.blocks, axis, component.place, state.settings)
+        skirt = line_skirt(state.blocks, axis, component.line_index, state.settings)
         return state.with_columns("line", "all", [skirt])
 
     def noise_shares(
-        self, component: Component, axis: str, state: State, weight: Floats
+        self, component: Component, axis: str, state: State, expected_power: Floats
     ) -> tuple[Floats | float, list[Floats], list[Floats]]:
         """Return the power of the line and its skirt above the spectrum around them.
 
         The power of the bands of a resonance is free: its slopes are not known.
         """
-        blocks, place = state.blocks, component.place
+        blocks, place = state.blocks, component.line_index
         if place < 0 or math.isfinite(line_quality(blocks, state.baseline, axis, place)):
-            return super().noise_shares(component, axis, state, weight)
+            return super().noise_shares(component, axis, state, expected_power)
         total, _ = mean_line_power(blocks, axis)
         skirt = line_skirt(blocks, axis, place, state.settings)
         above = np.where(skirt, total - local_level(total), 0.0)
@@ -175,7 +181,7 @@ class SpectralLine(Statistic):
 
         The powers of bands show little of it, and slow noise is fitted to that of a slow one.
         """
-        axis_blocks, place = blocks.sel(axis=component.row[0]), component.place
+        axis_blocks, place = blocks.sel(axis=component.row[0]), component.line_index
         return place >= 0 and _has_constant_phase(axis_blocks, place)
 
     def estimate(self, fit: SizeFit) -> Sizes:
@@ -191,7 +197,7 @@ class SpectralLine(Statistic):
         # the strongest of several lines of an axis is last
         for component in sorted(fit.components, key=lambda component: component.evidence_nats):
             amplitude, frequency = estimate_line(
-                blocks, component.row[0], component.place, fit.state.settings
+                blocks, component.row[0], component.line_index, fit.state.settings
             )
             response = np.sinc(frequency[0] / float(blocks.attrs["sampling_rate_hz"]))
             if is_sway:
@@ -205,21 +211,21 @@ class SpectralLine(Statistic):
         self, component: Component, region: Region, blocks: xr.Dataset, settings: Settings
     ) -> bool:
         """Return whether a mismatch is at the frequency of the line, or of samples."""
-        if str(region["view"]) not in self.explains:
+        if region["view"] not in self.explained_views:
             return False
         if region["view"] == "cross_axis":
-            return str(region["what"]) != "slow"
-        if component.place < 0 or region["view"] == "distribution":
+            return region["quantity"] != "slow"
+        if component.line_index < 0 or region["view"] == "distribution":
             return True
         lines = blocks["line_frequency"].values
-        mine = float(lines[component.place])
+        mine = float(lines[component.line_index])
         if np.isfinite(region["frequency"]):
             return bool(
                 abs(region["frequency"] - mine)
                 <= LEAK_LINES * (lines[1] - lines[0]) + settings.line_width_share * mine
             )
         tau = SINE_TAU_CYCLES / mine  # where the Allan variance of a sine is largest
-        return str(region["what"]).startswith(("avar", "level", "variance")) and bool(
+        return region["quantity"].startswith(("avar", "level", "variance")) and bool(
             region["tau_min_s"] / settings.line_tau_ratio
             <= tau
             <= region["tau_max_s"] * settings.line_tau_ratio
@@ -231,12 +237,12 @@ class SpectralLine(Statistic):
 
     def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
         """Return the averaging time at which the Allan variance of the line is largest."""
-        if component.place < 0:
+        if component.line_index < 0:
             return super().averaging_times(component, blocks)
-        tau = SINE_TAU_CYCLES / float(blocks["line_frequency"].values[component.place])
+        tau = SINE_TAU_CYCLES / float(blocks["line_frequency"].values[component.line_index])
         return tau, tau
 
-    def describe(self, region: Region, when: str) -> str:
+    def describe(self, region: Mapping[str, Any], when: str) -> str:
         return (
             f"The spectrum of {axes_text(region['axes'])} has a line at "
             f"{region.get('frequency', np.nan):.5g} Hz {when}, at {region['ratio']:.3g} times the "
@@ -256,7 +262,7 @@ def explained_lines(state: State) -> Bools:
     )
 
 
-def _equal_block_share(blocks: xr.Dataset, windows: Windows) -> Floats:
+def _equal_block_share(blocks: xr.Dataset, windows: BlockWindows) -> Floats:
     """Return the equivalent share of equal-power blocks in a mean, by window and line."""
     power, shape = (blocks[name].values for name in ("power", "shape"))
     present = np.isfinite(power) & (shape > 0)

@@ -82,10 +82,10 @@ class Telegraph(BlockMeanStatistic):
         """Return any course of levels, which the means determine."""
         return [Candidate(_LEVELS, self, (), (Variant({}, ("0",), np.empty(0)),))]
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield two levels; the means determine the course and its times."""
-        if case.prediction.levels:
-            yield Variant({}, (case.prediction.levels,), np.empty(0))
+        if prospect.prediction.levels:
+            yield Variant({}, (prospect.prediction.levels,), np.empty(0))
 
     def evidence(self, group: Sequence[Candidate], trial: Trial) -> list[CandidateEvidence]:
         """Compute the evidence of a bias of two levels, by axis.

@@ -25,7 +25,7 @@ from gyrostab.diagnose.predict.linear_model import (
 )
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.predict.windows import distinct_variants
-from gyrostab.diagnose.reduce.block_statistics import measured
+from gyrostab.diagnose.reduce.schema import read_as_measured
 from gyrostab.diagnose.statistics.base import NullDraw, Statistic
 from gyrostab.diagnose.statistics.cross_spectrum import draw_coherency
 from gyrostab.physics.base import Effect
@@ -38,8 +38,8 @@ class Transfer(Statistic):
 
     name = "transfer"
     view = "davar"
-    explains = ("davar", "cross_axis", "spectrum", "mean", "distribution")
-    contained_in = ("davar",)
+    explained_views = ("davar", "cross_axis", "spectrum", "mean", "distribution")
+    containing_views = ("davar",)
     error_shows_in = ("transfer",)
     is_power_weighted = True
     is_transfer = True
@@ -66,11 +66,11 @@ class Transfer(Statistic):
         """
         usable = {*_reference_channels(blocks), *windows.axes}
         by_channel: dict[str, list[Variant]] = {}
-        for case in prospects:
-            for (parameter, channel), transfer in case.prediction.transfer.items():
+        for prospect in prospects:
+            for (parameter, channel), transfer in prospect.prediction.transfer.items():
                 if channel in usable:
                     by_channel.setdefault(channel, []).append(
-                        Variant(case.values, (parameter,), np.asarray(transfer)[None])
+                        Variant(prospect.values, (parameter,), np.asarray(transfer)[None])
                     )
         is_without_channel = kind.name == "real_motion" and not driver
         if is_without_channel or (by_channel and kind.stage == "motion"):
@@ -91,7 +91,7 @@ class Transfer(Statistic):
         )
         root = np.sqrt(np.where(power > 0.0, power, np.nan))
         share = _moving_share(candidates[0].reference[0], power, state)
-        weight = 2.0 * state.blocks["shape"].values[row] / state.weight[row]
+        weight = 2.0 * state.blocks["shape"].values[row] / state.expected_power[row]
         weight = np.where(
             np.isfinite(root) & np.isfinite(weight) & ~state.masked[row][:, None], weight, 0.0
         )
@@ -120,10 +120,11 @@ class Transfer(Statistic):
         return state
 
     def noise_shares(
-        self, component: Component, axis: str, state: State, weight: Array
+        self, component: Component, axis: str, state: State, expected_power: Array
     ) -> tuple[Array | float, list[Array], list[Array]]:
         """Return the power that follows the channel or the other axis."""
-        mean, _ = component_mixture(component, replace(state, weight=weight)).moments()
+        state = replace(state, expected_power=expected_power)
+        mean, _ = component_mixture(component, state).moments()
         transfer = np.tensordot(mean, component.variant.design, axes=1)
         power = reference_channel_power(component.candidate.reference[0], state.blocks)
         return np.abs(transfer) ** 2 * np.nan_to_num(power), [], []
@@ -138,7 +139,7 @@ def reference_channel_of(
     """
     axes = [str(axis) for axis in blocks["axis"].values]
     if name in axes:
-        cross = records_last(measured(data, "cross").values, 3)
+        cross = records_last(read_as_measured(data, "cross").values, 3)
         has_power = np.isfinite(blocks["power"].values[row])[..., None]
         expected = expected_cross(baseline)
         cross = cross if expected is None else cross - expected[..., None]

@@ -17,6 +17,7 @@ from gyrostab.diagnose.baseline.expected_statistics import sum_noise
 from gyrostab.diagnose.evidence.held_out import mean_residual
 from gyrostab.diagnose.evidence.products import axis_noise
 from gyrostab.diagnose.evidence.wandering import expected_processes, with_process
+from gyrostab.diagnose.predict.average_sizes import Size
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
     CandidateEvidence,
@@ -50,12 +51,12 @@ class WanderingBias(RandomProcess):
     is_random_bias = True
     is_tried_last = True  # it resembles any slow course
 
-    def design(self, case: Prospect) -> Iterator[Variant]:
+    def design(self, prospect: Prospect) -> Iterator[Variant]:
         """Yield a bias without a course that the block means show."""
-        for name, (time, variance) in case.prediction.wander.items():
-            if is_correlated_bias(name, case.prediction, case.blocks):
+        for name, (time, variance) in prospect.prediction.wander.items():
+            if is_correlated_bias(name, prospect.prediction, prospect.blocks):
                 yield Variant(
-                    case.values, (name,), np.asarray(variance)[None], squared=True, time=time
+                    prospect.values, (name,), np.asarray(variance)[None], squared=True, time=time
                 )
 
     def nuisance_alternatives(self, blocks: xr.Dataset) -> list[Candidate]:
@@ -111,7 +112,7 @@ class WanderingBias(RandomProcess):
 
     def estimate(self, fit: SizeFit) -> Sizes:
         """Estimate the rms of every axis, and the correlation time that they have in common."""
-        out: dict[str, tuple[float, ...]] = {}
+        out: dict[str, Size] = {}
         times = []
         for component in fit.components:
             (name,), axis = component.variant.columns, component.row[0]

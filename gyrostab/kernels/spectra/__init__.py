@@ -1,1 +1,1 @@
-"""Periodograms of blocks with gaps, their expectation, and outliers."""
+"""Periodograms of blocks with gaps, and their expectation."""

@@ -1,4 +1,4 @@
-"""Periodograms of blocks with missing samples, averaged over bands, and statistics by phase.
+"""Periodograms of blocks with missing samples, averaged over bands.
 
 A block of L samples y with the mask m (1 where present) and the taper w has the ordinates
 
@@ -58,127 +58,6 @@ def band_edges(size: int, bands: int = 16) -> Ints:
     """
     top = ordinates(size) + 1
     return np.unique(np.round(np.geomspace(1, top, bands + 1)).astype(np.int64))
-
-
-@njit(**KERNEL)
-def resent_samples(bits, min_length, out):  # type: ignore[no-untyped-def]
-    """Count the samples of each block that repeat earlier ones in their order.
-
-    Such samples belong to a run in which each equals the one at the same distance before, at least
-    two samples away. A value equal to the one right before it is in no run.
-
-    Parameters
-    ----------
-    bits : ndarray of int64, shape (block, sample)
-        Values as bit patterns; 0 where missing or exactly zero.
-    min_length : int
-        Samples that a run has at least.
-    out : ndarray of int64, shape (block, 2)
-        Overwritten with the samples in runs, and the runs.
-    """
-    size = bits.shape[1]
-    mask = 3
-    while mask < 2 * size:
-        mask = 2 * mask + 1
-    table = np.empty(mask + 1, np.int64)
-    for b in range(bits.shape[0]):
-        row = bits[b]
-        table[:] = -1
-        samples, runs, length, lag = 0, 0, 0, 0
-        for i in range(size):
-            value = row[i]
-            slot = (value ^ (value >> 23) ^ (value >> 41)) & mask
-            while table[slot] >= 0 and row[table[slot]] != value:
-                slot = (slot + 1) & mask
-            earlier = table[slot]
-            is_new = value == 0 or earlier < 0 or earlier == i - 1
-            if value != 0:
-                table[slot] = i
-            goes_on = not is_new and length > 0 and row[i - lag] == value
-            if not goes_on:
-                length, lag = 0, i - earlier
-            length = 0 if is_new else length + 1
-            if length == min_length:
-                samples += min_length
-                runs += 1
-            elif length > min_length:
-                samples += 1
-        out[b, 0], out[b, 1] = samples, runs
-
-
-@njit(**KERNEL)
-def block_samples(x, centred, moments, counts):  # type: ignore[no-untyped-def]
-    """Compute statistics of the samples of each block, in one pass.
-
-    Parameters
-    ----------
-    x : ndarray, shape (block, sample)
-        Values, NaN where missing.
-    centred : ndarray, shape (block, sample)
-        Overwritten with the values minus the mean of their block, 0 where missing.
-    moments : ndarray, shape (block, 5)
-        Overwritten with mean, second and fourth central moment, smallest and largest value; NaN in
-        an empty block.
-    counts : ndarray of int64, shape (block, 9)
-        Overwritten with the samples present, exact zeros, samples equal to the one before but for
-        zeros, samples equal to the smallest and to the largest value of the block, how many of
-        these two are equal to the one before and no zeros, and the runs of samples that are equal
-        to the one before and no zeros, and of zeros.
-    """
-    size = x.shape[1]
-    for b in range(x.shape[0]):
-        row = x[b]
-        first, low, high, total = np.nan, np.inf, -np.inf, 0.0
-        present, zeros, repeats, runs, zero_runs = 0, 0, 0, 0, 0
-        repeated, zeroed = False, False
-        for i in range(size):
-            value = row[i]
-            if value != value:
-                repeated, zeroed = False, False
-                continue
-            if present == 0:
-                first = value
-            present += 1
-            total += value - first
-            zeros += value == 0.0
-            is_repeat = i > 0 and value == row[i - 1] and value != 0.0
-            repeats += is_repeat
-            runs += is_repeat and not repeated
-            zero_runs += value == 0.0 and not zeroed
-            repeated, zeroed = is_repeat, value == 0.0
-            low, high = min(low, value), max(high, value)
-        mean = first + total / max(present, 1)
-        second, fourth = 0.0, 0.0
-        lows, highs, lows_again, highs_again = 0, 0, 0, 0
-        for i in range(size):
-            value = row[i]
-            if value != value:
-                centred[b, i] = 0.0
-                continue
-            square = (value - mean) ** 2
-            second += square
-            fourth += square * square
-            centred[b, i] = value - mean
-            lows += value == low
-            highs += value == high
-            if i > 0 and value == row[i - 1] and value != 0.0:
-                lows_again += value == low
-                highs_again += value == high
-        counts[b, 0] = present
-        counts[b, 1] = zeros
-        counts[b, 2] = repeats
-        counts[b, 3] = lows
-        counts[b, 4] = highs
-        counts[b, 5] = lows_again
-        counts[b, 6] = highs_again
-        counts[b, 7] = runs
-        counts[b, 8] = zero_runs
-        moments[b, 0] = mean
-        moments[b, 1] = second / max(present, 1)
-        moments[b, 2] = fourth / max(present, 1)
-        moments[b, 3], moments[b, 4] = low, high
-        if present == 0:
-            moments[b, :] = np.nan
 
 
 def gap_spectra(present: Bools, weights: Floats) -> tuple[Floats, Complexes, Complexes]:
@@ -328,24 +207,3 @@ def band_powers(first, second, expected, place, edges, rate):  # type: ignore[no
                 norm += expected[place[b], k]
             out[b, band] = total / (norm * rate)
     return out
-
-
-@njit(**KERNEL)
-def phase_profile(centred, present, phase, low, high, sums, counts):  # type: ignore[no-untyped-def]
-    """Add sum and number of the centred values by block and by phase, in equal bins.
-
-    Parameters
-    ----------
-    centred, phase : ndarray, shape (block, sample)
-    present : ndarray of bool, shape (block, sample)
-    low, high : float
-    sums, counts : ndarray, shape (block, bin)
-    """
-    bins = sums.shape[1]
-    scale = bins / (high - low)
-    for b in range(centred.shape[0]):
-        for i in range(centred.shape[1]):
-            if present[b, i] and phase[b, i] == phase[b, i]:
-                at = min(max(np.int64((phase[b, i] - low) * scale), 0), bins - 1)
-                sums[b, at] += centred[b, i]
-                counts[b, at] += 1

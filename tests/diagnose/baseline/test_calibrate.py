@@ -16,7 +16,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
 )
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
-from gyrostab.diagnose.baseline.posterior import Fit, fit_squares
+from gyrostab.diagnose.baseline.posterior import BandPowers, fit_squares
 from gyrostab.diagnose.baseline.quiescent import find_quiescent_blocks
 from gyrostab.diagnose.evidence.wandering import no_processes
 from gyrostab.diagnose.nulls.records import null_records
@@ -219,7 +219,7 @@ def test_baseline_from_a_model_includes_its_effects():
     )
     z = ((blocks["mean"] - baseline["known_mean"]) / np.sqrt(baseline["mean_variance"])).values
     assert np.abs(z - z.mean(axis=1, keepdims=True)).max() < 5.0
-    assert baseline.attrs["left_out"] == ["telegraph"]
+    assert baseline.attrs["shown_elsewhere"] == ["telegraph"]
     assert float(baseline["coefficient"].sel(axis="x", term="R")) == 0.1
     assert float(baseline["stderr"].max()) == 0.0
     nulls = next(null_records(blocks, baseline, count=3, rng=np.random.default_rng(1)))
@@ -282,7 +282,7 @@ def test_fit_maximises_the_likelihood_even_without_a_good_fit():
     columns = np.stack([f**2, np.ones(f.size), 1.0 / f, 1.0 / f**2], axis=1)
     # waves below, a steep end above
     bump = [2e4, 2e3, 700, 350, 160, 50, 11, 5, 6, 10, 19, 35, 60, 105, 31]
-    fit = Fit(
+    bands = BandPowers(
         np.array(bump, np.float64),
         columns,
         26.0 * np.array([1, 1, 1, 1, 2, 3, 4, 6, 6.5, 10, 14, 19, 26, 37, 50]),
@@ -290,14 +290,14 @@ def test_fit_maximises_the_likelihood_even_without_a_good_fit():
 
     def worse(logarithms):
         expected = columns @ np.exp(logarithms)
-        return float((fit.weight * (np.log(expected) + fit.power / expected)).sum())
+        return float((bands.weight * (np.log(expected) + bands.power / expected)).sum())
 
     rng = np.random.default_rng(0)
     best = min(
         minimize(worse, rng.uniform(-5, 5, 4), method="Nelder-Mead", options={"maxiter": 4000}).fun
         for _ in range(8)
     )
-    square, *_ = fit_squares(fit)
+    square, *_ = fit_squares(bands)
     assert worse(np.log(np.maximum(square, 1e-12))) < best + 0.1
 
 

@@ -16,11 +16,11 @@ from gyrostab.diagnose.baseline.correlated_bias import CorrelatedBias, find_corr
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import find_components
-from gyrostab.diagnose.predict.condition import condition_on, refit_weights
+from gyrostab.diagnose.predict.condition import condition_on, refit_powers
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.noise import NORMAL_95
 from gyrostab.simulate import simulate
 
@@ -103,8 +103,10 @@ def test_bands_of_lines_are_no_evidence_of_a_bias():
     state = replace(state, baseline=state.baseline.assign(angle_variance=("axis", np.zeros(1))))
     bands = state.blocks.sizes["band"]
     where = np.flatnonzero(state.blocks["band_high"].values <= 0.3)
-    columns = [np.broadcast_to(np.eye(bands)[band], state.weight.shape[1:]) for band in where]
-    in_model = refit_weights(state.with_columns("power", "x", columns))
+    columns = [
+        np.broadcast_to(np.eye(bands)[band], state.expected_power.shape[1:]) for band in where
+    ]
+    in_model = refit_powers(state.with_columns("power", "x", columns))
     found = [find_correlated_bias(tried, "x") for tried in (in_model, state)]
     with_lines, without = (bias.nats for bias in found if bias is not None)
     assert with_lines < 3.0 < without

@@ -62,7 +62,7 @@ def test_average_is_named_with_its_length(taps: int, seed: int) -> None:
     blocks = filtered_blocks([1.0 / taps] * taps, [1.0], seed, size=9_000)
     baseline, records = nulls(blocks, 10)
     identifications = name_effects(blocks, baseline, records)
-    assert not identifications.unknown
+    assert not identifications.unidentified
     (fitted,) = (
         fitted
         for fitted in fit_identifications(identifications, baseline)

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.baseline.calibrate import calibrate_noise, calibrate_on_known
+from gyrostab.diagnose.baseline.calibrate import calibrate_noise, calibrate_on_training_blocks
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -48,13 +48,13 @@ def test_the_error_of_a_short_calibration_covers_the_truth():
 
 
 @pytest.mark.parametrize("left_out", [False, True])
-def test_an_axis_without_spectra_in_the_known_blocks_is_not_calibrated_again(left_out):
+def test_an_axis_without_spectra_in_the_training_blocks_is_not_calibrated_again(left_out):
     blocks = reduce_log(log({"N": 0.003}, duration="30min"))
     baseline = calibrate_noise(blocks)
-    known = np.arange(blocks.sizes["block"]) % 4 > 0
+    training = np.arange(blocks.sizes["block"]) % 4 > 0
     if left_out:
-        blocks["power"].values[0, known] = np.nan
-    again = calibrate_on_known(blocks, baseline, known)
+        blocks["power"].values[0, training] = np.nan
+    again = calibrate_on_training_blocks(blocks, baseline, training)
     assert (again is baseline) == left_out
 
 

@@ -10,7 +10,10 @@ import xarray as xr
 
 import gyrostab
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.baseline.known_effects import expect_known_motion, remove_known_motion
+from gyrostab.diagnose.baseline.known_effects import (
+    find_blocks_with_known_motion,
+    remove_known_motion,
+)
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.task import Task, lines_without_motion
@@ -100,7 +103,7 @@ def test_only_blocks_with_known_motion_are_left_out():
     step = np.zeros((3, blocks.sizes["block"]))
     step[1, 90:] = 1.0
     known = baseline.assign(known_mean=(("axis", "block"), step))
-    moving = expect_known_motion(blocks, known)
+    moving = find_blocks_with_known_motion(blocks, known)
     assert np.argwhere(moving).tolist() == [[1, 89], [1, 90]]
     out = remove_known_motion(blocks, known)
     for name in ("power", "kurtosis"):

@@ -14,7 +14,7 @@ from gyrostab.diagnose.estimate.conditioned_baseline import add_outlier_power, p
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.identify.examination import Identifications
+from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.diagnose.settings import Settings
@@ -287,9 +287,11 @@ def test_intervals_of_outliers_exclude_zero_and_contain_the_truth(number: int, k
     truth = {"per_hour": number / (samples / 36_000.0), "size": SCATTER * size}
     held = {name: [] for name in truth}
     for axis in axes:
-        if float(blocks["peaks"].sel(axis=axis).sum()) < 3.0:  # too few to be identified
+        if float(blocks["outlier_count"].sel(axis=axis).sum()) < 3.0:  # too few to be identified
             continue
-        sizes = estimate_from_counts("spikes", "peaks", axis, blocks, CountEvidence({}), Settings())
+        sizes = estimate_from_counts(
+            "spikes", "outlier_count", axis, blocks, CountEvidence({}), Settings()
+        )
         for name, (_, _, low, high) in sizes.items():
             assert low > 0.0
             held[name].append(low < truth[name] < high)
@@ -433,7 +435,7 @@ def test_spikes_in_most_blocks_keep_their_size_and_power():
         rng.standard_normal((1, 15_000)) + 70.0 * rng.standard_normal((1, 15_000)) * hit
     )
     blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["x"]))
-    assert (blocks["peaks"] > 0).mean() > 0.6
+    assert (blocks["outlier_count"] > 0).mean() > 0.6
     baseline, records = nulls(blocks, 40)
     (fitted,) = fit_identifications(
         identifications := name_effects(blocks, baseline, records), baseline
@@ -450,7 +452,7 @@ def test_spikes_in_most_blocks_keep_their_size_and_power():
         ([], [fitted]),
     ):  # effects of the recording alone, or of the simulation too
         surfaces = conclude._make_surfaces_with_outliers(
-            blocks, conclude.Fit(identifications, clean, lacking, known), clean, clean
+            blocks, conclude.FinalFit(identifications, clean, lacking, known), clean, clean
         )
         short = surfaces["avar"].isel(tau=0).mean(["axis", "window"])
         before, after = (

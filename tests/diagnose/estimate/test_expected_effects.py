@@ -8,7 +8,7 @@ from scipy import signal
 
 import gyrostab
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
-from gyrostab.diagnose.baseline.known_effects import expect_known_motion
+from gyrostab.diagnose.baseline.known_effects import find_blocks_with_known_motion
 from gyrostab.diagnose.evidence.wandering import expected_processes
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -131,7 +131,7 @@ def test_blocks_with_a_moving_known_rate_are_left_out(blocks):
     baseline = baseline_from_model(
         blocks, {"noise": NOISE, "effect": [{"name": "scale_factor", "linear": 1000.0}]}
     )
-    moving = expect_known_motion(blocks, baseline)[0]
+    moving = find_blocks_with_known_motion(blocks, baseline)[0]
     begin, end = blocks["begin"].values, blocks["end"].values
     ramp = ((begin < 330.0) & (end > 300.0)) | ((begin < 830.0) & (end > 800.0))
     assert moving[ramp].all()

@@ -13,16 +13,16 @@ from hypothesis import strategies as st
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
-from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.joint_fit import _make_estimate, fit_identifications
 from gyrostab.diagnose.estimate.upper_limits import find_upper_limits
-from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.identify.forms import choose_forms
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.settings import DEFAULTS
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.diagnose.statistics.spectral_line import estimate_line, line_quality
 from gyrostab.simulate import simulate
 from tests.support import candidates as by_hand
@@ -130,7 +130,7 @@ def test_terms_not_separated_by_one_level_become_one(noise_only, levels, has_bot
     frame = identify_by_hand(
         changed, baseline, "vibration_rectification", "mean", ("sensitivity", "quartic")
     )
-    (fitted,) = fit_identifications(settle_forms(frame, baseline), baseline)
+    (fitted,) = fit_identifications(choose_forms(frame, baseline), baseline)
     assert set(fitted.parameters) == (
         {"sensitivity", "quartic"} if has_both_terms else {"sensitivity"}
     )
@@ -154,7 +154,7 @@ def test_single_term_is_the_plainest_of_equivalent_ones(noise_only, levels, colu
     sizes = (0.005, 0.0) if column == "sensitivity" else (0.0, 1e-4)
     changed, baseline = change_vibration(noise_only, g, *sizes), noise_only[1]
     frame = identify_by_hand(changed, baseline, "vibration_rectification", "mean", (column,))
-    (fitted,) = fit_identifications(settle_forms(frame, baseline), baseline)
+    (fitted,) = fit_identifications(choose_forms(frame, baseline), baseline)
     is_one_level = levels[0] == levels[1]
     assert set(fitted.parameters) == ({"sensitivity"} if is_one_level else {column})
     assert ("does not separate" in fitted.say()) is is_one_level
@@ -172,7 +172,7 @@ def test_axes_of_one_effect_have_one_choice_of_a_text():
     assert set(ways) == {"point", "average"}
     components = (first, replace(first, row=("y",), variant=ways["average"]))
     merged = replace(identification, axes=("x", "y"), components=components)
-    settled = settle_forms(replace(frame, identified=(merged,)), baseline)
+    settled = choose_forms(replace(frame, identified=(merged,)), baseline)
     texts = [variant.variant.texts for variant in settled.identified[0].components]
     assert texts == [{"sampling": "point"}] * 2
     (fitted,) = fit_identifications(settled, baseline)
@@ -273,7 +273,7 @@ def test_line_has_its_frequency_to_one_bin_and_the_amplitude_of_the_rate():
         blocks, baseline, "spectral_line", "spectral_line", ("amplitude",)
     )
     place = int(blocks["line_power"].sel(axis="x").mean("part").values.argmax())
-    component = replace(identifications.identified[0].components[0], place=place)
+    component = replace(identifications.identified[0].components[0], line_index=place)
     (fitted,) = fit_identifications(
         replace(
             identifications,

@@ -12,18 +12,18 @@ from gyrostab.diagnose.baseline.calibrate import assemble_baseline, calibrate_ax
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.constant_rate import fit_white_noise
-from gyrostab.diagnose.estimate.forms import settle_forms
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.identify.forms import choose_forms
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import finish as conclude
 from gyrostab.diagnose.settings import DEFAULTS
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.physics.electronics import GaussMarkov
 from gyrostab.simulate import simulate
 from tests.support.candidates import identify_by_hand, make_identifications, select_candidate
@@ -87,7 +87,7 @@ def test_diagnosis_separates_noise_and_effects(shaken):
     assert noise_coefficient(fit.noise, "N")[0] == noise_coefficient(after, "N")[0] < 1.2 * 0.003
     (size,) = fit.fitted[0].parameters.values()
     assert size.low < 0.002 < size.high
-    held = conclude.measure_evidence(identifications.state.blocks, baseline, identifications, first)
+    held = conclude.measure_held_out(identifications.state.blocks, baseline, identifications, first)
     assert held["misfit_after"] == pytest.approx(1.0, abs=0.15)
 
 
@@ -115,7 +115,7 @@ def test_noise_is_that_of_the_form_in_the_model():
     )
     baseline = calibrate_noise(blocks)
     frame = identify_by_hand(blocks, baseline, "temperature_noise", "power", ("quadratic",))
-    identifications = settle_forms(frame, baseline)
+    identifications = choose_forms(frame, baseline)
     first = fit_identifications(identifications, baseline)
     fit = conclude.refit_with_noise(identifications, baseline, first)
     (size,) = fit.fitted[0].parameters.values()
@@ -132,7 +132,7 @@ def test_noise_belongs_to_the_exponent_in_the_model():
     by_evidence = identify_by_hand(
         blocks, baseline, "ageing_noise", "power", ("growth",), exponent=0.5
     )
-    identifications = settle_forms(by_evidence, baseline)
+    identifications = choose_forms(by_evidence, baseline)
     (component,) = identifications.identified[0].components
     assert component.variant.values["exponent"] == 1.0
     first = fit_identifications(identifications, baseline)
@@ -247,11 +247,10 @@ def test_axis_without_an_effect_keeps_its_noise(shaken):
 def test_axes_that_need_larger_grids_before_than_after(shaken):
     identifications, baseline, _ = shaken
     blocks = identifications.state.blocks
-    quiet = np.ones((2, blocks.sizes["block"]), np.bool_)
-    quiet[0, 2:] = False
-    wide = assemble_baseline(
-        blocks, calibrate_axes(blocks, quiet, DEFAULTS), quiet=quiet, attrs=baseline.attrs
-    )
+    quiescent = np.ones((2, blocks.sizes["block"]), np.bool_)
+    quiescent[0, 2:] = False
+    posteriors = calibrate_axes(blocks, quiescent, DEFAULTS)
+    wide = assemble_baseline(blocks, posteriors, quiescent=quiescent, attrs=baseline.attrs)
     after = recalibrate(identifications, wide, fit_identifications(identifications, wide))
     assert after.sizes["grid"] < wide.sizes["grid"]
     for axis in "xy":

@@ -16,7 +16,7 @@ from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence, evidence_by_effect
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.regression.state_space import flicker_states
 from gyrostab.units import HOUR

@@ -13,10 +13,10 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence, line_skirt
 from gyrostab.diagnose.evidence.wandering import with_process
-from gyrostab.diagnose.identify import selection
+from gyrostab.diagnose.identify import forward_search
 from gyrostab.diagnose.identify.components import merge_lines
 from gyrostab.diagnose.identify.examination import nuisance_alternatives
-from gyrostab.diagnose.identify.identification import Selection, add_selection, form_error
+from gyrostab.diagnose.identify.selections import Selection, add_selection, form_error
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.filter_response import undo_filter
@@ -24,7 +24,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.diagnose.statistics.spectral_line import estimate_line
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.spectra.line_levels import local_level
@@ -132,10 +132,10 @@ def test_each_line_is_a_separate_identification(lines: tuple[Selection, ...]) ->
     assert [identification.effect for identification in lines] == ["spectral_line"] * 3
     assert all(identification.axes == ("x",) for identification in lines)
     assert all(
-        len({component.place for component in identification.components}) == 1
+        len({component.line_index for component in identification.components}) == 1
         for identification in lines
     )
-    assert len({identification.components[0].place for identification in lines}) == 3
+    assert len({identification.components[0].line_index for identification in lines}) == 3
     assert all(
         {"real_motion", "supply_bias", "feedback_reset"} <= set(identification.alternatives)
         for identification in lines
@@ -159,10 +159,12 @@ def test_evidence_is_recalled_only_where_nothing_has_changed() -> None:
     lost = blocks.assign(mean=blocks["mean"].where(blocks["begin"] > 0.0))
     states = {
         "line": with_line,
-        "another line in its band": condition_on(with_line, [replace(line, place=line.place + 1)]),
+        "another line in its band": condition_on(
+            with_line, [replace(line, line_index=line.line_index + 1)]
+        ),
         "jump": with_jump,
         "lost block": replace(start, blocks=lost),
-        "other weights": replace(start, weight=1.1 * start.weight),
+        "other weights": replace(start, expected_power=1.1 * start.expected_power),
         "masked": replace(start, masked=start.masked | (np.arange(start.masked.shape[1]) < 2)),
         "random walk": replace(
             start, baseline=with_process(start.baseline, "x", np.full(start.masked.shape[1], 1e-3))
@@ -186,7 +188,7 @@ def test_evidence_is_recalled_only_where_nothing_has_changed() -> None:
 
 @pytest.mark.slow
 def test_more_lines_than_are_named_do_not_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(selection, "MAX_LINES", 1)
+    monkeypatch.setattr(forward_search, "MAX_LINES", 1)
     blocks = sines({0.7: 0.3, 2.03: 0.25}, size=6_000, axes=1, jump=0.25)
     baseline, records = nulls(blocks, 20)
     identified = name_effects(blocks, baseline, records).identified

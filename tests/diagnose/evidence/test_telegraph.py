@@ -15,9 +15,9 @@ from gyrostab.diagnose.evidence.telegraph import (
     telegraph_evidence,
     visit_columns,
 )
-from gyrostab.diagnose.identify.examination import Identifications
 from gyrostab.diagnose.identify.identifiability import keep_physical
-from gyrostab.diagnose.identify.naming_order import put_followers_first
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.naming_order import drop_switching_with_a_cause
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -265,8 +265,8 @@ def test_an_effect_of_a_switching_channel_comes_first(
         FOLLOWS[0]: [led(channel, evidence_nats, axis)],
         "bias_jump": [jump(50, 20.0)],
     }
-    assert put_followers_first(HOPS_FIRST, components, state) == expected
-    assert put_followers_first(["telegraph", "bias_jump"], components, state) == [
+    assert drop_switching_with_a_cause(HOPS_FIRST, components, state) == expected
+    assert drop_switching_with_a_cause(["telegraph", "bias_jump"], components, state) == [
         "telegraph",
         "bias_jump",
     ]

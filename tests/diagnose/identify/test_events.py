@@ -17,7 +17,7 @@ from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.diagnose.statistics.power import burst_intervals
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import find_components
@@ -71,7 +71,7 @@ def test_temporary_noise_is_not_ageing(inside: slice) -> None:
     blocks = reduce_rates(noise_with_levels(factor))
     identifications = name_effects(blocks, *nulls(blocks, 40))
     assert not identifications.identified
-    first = identifications.unknown[0]
+    first = identifications.unidentified[0]
     assert first.effect == "~burst"
     begin, end = (first.components[0].variant.values[name] / 20.0 for name in ("begin", "end"))
     assert abs(begin - range(BLOCKS)[inside][0]) <= 1
@@ -87,7 +87,7 @@ def test_ageing_noise_only_grows(first: float, last: float, named: list[str]) ->
     blocks = reduce_rates(noise_with_levels(np.sqrt(np.linspace(first**2, last**2, BLOCKS))))
     identifications = name_effects(blocks, *nulls(blocks, 40))
     assert [identification.effect for identification in identifications.identified] == named
-    assert bool(identifications.unknown) == (not named)
+    assert bool(identifications.unidentified) == (not named)
 
 
 def test_stretches_of_all_lengths_reach_both_ends() -> None:

@@ -12,8 +12,8 @@ import pytest
 import xarray as xr
 
 import gyrostab
-from gyrostab.diagnose.identify.examination import Identifications
-from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import drop_changed_tails
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -117,7 +117,7 @@ def test_docs_contain_the_tables_of_the_script() -> None:
 
 
 def identifications(
-    statistic: str, *, place: int = -1, evidence_nats: float = 40.0
+    statistic: str, *, line_index: int = -1, evidence_nats: float = 40.0
 ) -> Identifications:
     shape = np.zeros((1, 1, 40))
     shape[..., 10:20] = 1.0
@@ -127,7 +127,7 @@ def identifications(
         variant,
         ("y",),
         evidence_nats,
-        place,
+        line_index,
     )
     identification = Selection(
         "shupe",
@@ -167,7 +167,9 @@ def test_effect_without_a_mismatch_gets_one_where_it_acts(
     statistic: str, view: str, taus: tuple[float, float]
 ) -> None:
     (region,) = identified_mismatches(
-        identifications(statistic, place=9 if statistic == "spectral_line" else -1), blocks(), []
+        identifications(statistic, line_index=9 if statistic == "spectral_line" else -1),
+        blocks(),
+        [],
     )
     assert (region["view"], region["axes"], region["explained_by"]) == (view, ["y"], ["shupe"])
     assert (region["tau_min_s"], region["tau_max_s"]) == pytest.approx(taus)

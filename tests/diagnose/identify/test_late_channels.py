@@ -13,13 +13,14 @@ import xarray as xr
 from gyrostab.arrays import Floats
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify import late_channels
-from gyrostab.diagnose.identify.examination import Identifications, prepare_examination
+from gyrostab.diagnose.identify.examination import prepare_examination
+from gyrostab.diagnose.identify.forward_search import identify_effects
+from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.identify.late_channels import (
     DelaySearch,
     chance_of_best,
     find_late_channel,
 )
-from gyrostab.diagnose.identify.selection import identify_effects
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.schema.delays import move_channels
@@ -154,7 +155,7 @@ def test_late_channel_explains_more_than_all_else(
     identifications: Any = SimpleNamespace(
         examination=examination,
         identified=(),
-        unknown=(unexplained,),
+        unidentified=(unexplained,),
         state=SimpleNamespace(blocks=blocks),
     )
     monkeypatch.setattr(late_channels, "DelaySearch", GivenEvidence)

@@ -10,7 +10,7 @@ from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.ingest.make_log import make_log
 from tests.support.candidates import find_components, winning_forms
 

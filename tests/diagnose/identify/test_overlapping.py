@@ -7,7 +7,7 @@ import pytest
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.identify.components import renew_component, split_layers
-from gyrostab.diagnose.identify.identification import Selection, with_axes_of
+from gyrostab.diagnose.identify.selections import Selection, with_axes_of
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -119,4 +119,4 @@ def test_a_pair_is_found_where_any_course_explains_more_than_each():
         "temperature_noise",
         "light_power_noise",
     }
-    assert not identifications.unknown
+    assert not identifications.unidentified

@@ -19,7 +19,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import DEFAULTS
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.diagnose.task import Task, take_lines_at_rest
 from gyrostab.ingest.make_log import make_log
 from gyrostab.progress import no_stage
@@ -166,7 +166,7 @@ def test_axis_that_turns_without_a_channel_leaks_into_another():
     identifications = name_effects(blocks, baseline, records)
     at_rest = [other for other in identifications.identified if set(other.axes) & {"x", "y"}]
     assert [(other.effect, other.axes) for other in at_rest] == [("misalignment", ("x",))]
-    assert "z" in {axis for unknown in identifications.unknown for axis in unknown.axes}
+    assert "z" in {axis for selection in identifications.unidentified for axis in selection.axes}
 
 
 @pytest.mark.slow

@@ -11,9 +11,9 @@ import pytest
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.identify import selection as selecting
+from gyrostab.diagnose.identify import forward_search
 from gyrostab.diagnose.identify.examination import Examination, nuisance_alternatives
-from gyrostab.diagnose.identify.identification import (
+from gyrostab.diagnose.identify.selections import (
     Selection,
     ambiguous_evidence,
     make_selection,
@@ -25,7 +25,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.ingest.make_log import make_log
 
 MODEL = {"noise": {"N": 0.003, "K": 0.005}, "log": {"axes": ["x"]}}
@@ -60,7 +60,7 @@ def test_a_channel_that_two_others_make_superfluous_is_dropped():
         name: (30.0 + 5.0 * course, "degC") for name, course in zip(names, courses, strict=True)
     }
     examination = _examine(values, 1.0, channels, ("temperature_bias",))
-    chosen, *_ = selecting._select_all(examination)
+    chosen, *_ = forward_search._select_all(examination)
     assert chosen[0].driver == ("temperature",)
     _, settled = settle_selections(examination, prune_selections(examination, chosen))
     assert {identification.driver for identification in settled} == {(names[1],), (names[2],)}
@@ -75,10 +75,10 @@ def test_two_channels_are_named_where_a_random_walk_explains_more_than_each():
         for name, course in zip(("temperature", "temperature_2"), courses, strict=True)
     }
     examination = _examine(values, 1.0, channels, ("temperature_bias", "~red"))
-    evidence = selecting.score_candidates(examination, examination.start, ())
+    evidence = forward_search.score_candidates(examination, examination.start, ())
     best = max(evidence, key=lambda item: item.evidence_nats.max())
     assert best.candidate.effect == "~red"
-    chosen, _ = selecting._select_all(examination)
+    chosen, _ = forward_search._select_all(examination)
     assert {selection.driver for selection in chosen} == {("temperature",), ("temperature_2",)}
 
 
@@ -91,7 +91,7 @@ def test_an_effect_stays_beside_an_unidentified_burst():
     values = 0.18 * np.sqrt(5.0 * np.repeat(level, 100)) * rng.standard_normal(BLOCKS * 100)
     channels = {"vibration": (np.repeat(vibration, 100), "g")}
     examination = _examine(values, 5.0, channels, ("vibration_noise", "~N(t)", "~burst"))
-    chosen, *_ = selecting._select_all(examination)
+    chosen, *_ = forward_search._select_all(examination)
     named = [selection for selection in chosen if selection.is_named]
     others = [selection for selection in chosen if not selection.is_named]
     assert [selection.effect for selection in named] == ["vibration_noise"]
@@ -136,8 +136,10 @@ def test_both_of_a_pair_are_selected_at_once():
     values = 0.18 * np.random.default_rng(1).standard_normal(second.size)
     values += 0.3 * ((second >= 1000) & (second < 2200))
     examination = _examine(values, 1.0, {}, ("bias_jump", "~levels"))
-    evidence = selecting.score_candidates(examination, examination.start, ())
-    selections, failed = selecting._select_next(examination, evidence, examination.start, [], {})
+    evidence = forward_search.score_candidates(examination, examination.start, ())
+    selections, failed = forward_search._select_next(
+        examination, evidence, examination.start, [], {}
+    )
     (first, other) = (selection.components for selection in selections)
     at = sorted(component.variant.values["at"] for component in (*first, *other))
     assert at == pytest.approx([1000.0, 2200.0], abs=20.0)
@@ -149,9 +151,9 @@ def test_the_form_that_beats_an_effect_is_recorded():
     values = 0.18 * np.random.default_rng(2).standard_normal(second.size)
     values += 2.0 * np.clip((second - 1700.0) / 160.0, 0.0, 1.0)
     examination = _examine(values, 1.0, {}, ("bias_jump",))
-    evidence = selecting.score_candidates(examination, examination.start, ())
+    evidence = forward_search.score_candidates(examination, examination.start, ())
     beaten = {}
-    assert selecting._select_next(examination, evidence, examination.start, [], beaten) is None
+    assert forward_search._select_next(examination, evidence, examination.start, [], beaten) is None
     name, nats = beaten["bias_jump"]
     assert name == "a gradual change"
     assert nats > 3.0
@@ -163,25 +165,27 @@ def test_rejected_channels_do_not_use_up_the_number_of_effects(monkeypatch):
     def select_next(*_):
         number = next(rounds)
         failed = {f"channel {number}": ("a time-shifted channel", 1.0)}
-        return ([], failed) if number < 2 * selecting.MAX_EFFECTS else None
+        return ([], failed) if number < 2 * forward_search.MAX_EFFECTS else None
 
-    monkeypatch.setattr(selecting, "_select_next", select_next)
-    monkeypatch.setattr(selecting, "score_candidates", lambda *_, **__: [])
-    selecting._select_all(SimpleNamespace(start=None, expected=()))
+    monkeypatch.setattr(forward_search, "_select_next", select_next)
+    monkeypatch.setattr(forward_search, "score_candidates", lambda *_, **__: [])
+    forward_search._select_all(SimpleNamespace(start=None, expected=()))
     # the last round is repeated with what is tried last
-    assert next(rounds) == 2 * selecting.MAX_EFFECTS + 2
+    assert next(rounds) == 2 * forward_search.MAX_EFFECTS + 2
 
 
 def test_what_fails_the_time_shift_test_is_barred_before_random_biases_are_tried(monkeypatch):
     tried: list[tuple[set[str], bool]] = []
     answers = iter([([], {"shupe": ("a time-shifted channel", 3.0)}), None, None])
     monkeypatch.setattr(
-        selecting,
+        forward_search,
         "score_candidates",
-        lambda examination, state, barred, with_last: tried.append(({*barred}, with_last)),
+        lambda examination, state, barred, includes_last_resorts: tried.append(
+            ({*barred}, includes_last_resorts)
+        ),
     )
-    monkeypatch.setattr(selecting, "_select_next", lambda *given: next(answers))
-    chosen, beaten = selecting._select_all(SimpleNamespace(start=None, expected=()))
+    monkeypatch.setattr(forward_search, "_select_next", lambda *given: next(answers))
+    chosen, beaten = forward_search._select_all(SimpleNamespace(start=None, expected=()))
     assert not chosen
     assert list(beaten) == ["shupe"]
     assert tried == [(set(), False), ({"shupe"}, False), ({"shupe"}, True)]
@@ -204,7 +208,7 @@ def test_alternatives_of_a_strong_effect_are_listed_within_the_error_of_its_form
     values = 0.18 * rng.standard_normal(BLOCKS * 20) + 3.0 * course / course.std()
     channels = {"temperature": (30.0 + course, "degC"), "supply_voltage": (28.0 + other, "V")}
     examination = _examine(values, 1.0, channels, ("temperature_bias", "supply_bias"))
-    chosen, _ = selecting._select_all(examination)
+    chosen, _ = forward_search._select_all(examination)
     (settled,) = settle_selections(examination, prune_selections(examination, chosen))[1]
     rival = max(nats for key, nats in settled.instead.items() if "supply" in key)
     assert 3.0 < settled.evidence_nats - rival < 3.0 + 0.01 * settled.evidence_nats
@@ -226,8 +230,8 @@ def test_spikes_of_a_comb_of_lines_are_not_identified(monkeypatch):
         ("identify_expected_effects", lambda given: given),
         ("_select_all", lambda given: (found, {})),
         ("prune_selections", lambda given, chosen: chosen),
-        ("settle_selections", lambda given, chosen: (chosen, chosen)),
+        ("settle_selections", lambda given, chosen: ([], chosen)),
         ("withdraw_effects", lambda given, identified, unidentified: (identified, [])),
     ):
-        monkeypatch.setattr(selecting, name, result)
-    assert selecting.identify_effects(examination).identified == tuple(lines)
+        monkeypatch.setattr(forward_search, name, result)
+    assert forward_search.identify_effects(examination).identified == tuple(lines)

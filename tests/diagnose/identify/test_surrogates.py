@@ -20,7 +20,7 @@ from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.predict.windows import rebuild_variant
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.settings import Settings
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate
 from tests.support.candidates import find_components, select_candidate

@@ -8,11 +8,11 @@ import pytest
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.identify.components import sum_evidence
-from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.simulate import simulate
 from tests.support.candidates import find_components, make_identifications
 from tests.support.repetitions import first_of

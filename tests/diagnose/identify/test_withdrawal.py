@@ -13,11 +13,11 @@ from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify import withdrawal
 from gyrostab.diagnose.identify.examination import Examination, nuisance_alternatives
-from gyrostab.diagnose.identify.identification import Selection
-from gyrostab.diagnose.identify.selection import _select_all
-from gyrostab.diagnose.identify.withdrawal import variance_fluctuation
+from gyrostab.diagnose.identify.forward_search import _select_all
+from gyrostab.diagnose.identify.selections import Selection
+from gyrostab.diagnose.identify.withdrawal import measure_fluctuation
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
-from gyrostab.diagnose.predict.condition import refit_weights
+from gyrostab.diagnose.predict.condition import refit_powers
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
@@ -40,10 +40,11 @@ def fluctuation_left(blocks: xr.Dataset, *columns: np.ndarray) -> float:
     """Return the variance fluctuation with columns (block,) of added white power in the model."""
     state: State = initial_state(blocks, calibrate_noise(blocks))
     spread = [
-        np.broadcast_to(column[:, None], state.weight.shape[1:]).astype(float) for column in columns
+        np.broadcast_to(column[:, None], state.expected_power.shape[1:]).astype(float)
+        for column in columns
     ]
-    return variance_fluctuation(
-        refit_weights(state.with_columns("power", "x", spread)) if columns else state, "x"
+    return measure_fluctuation(
+        refit_powers(state.with_columns("power", "x", spread)) if columns else state, "x"
     )
 
 
@@ -52,7 +53,7 @@ def test_noise_that_fluctuates_on_one_axis_stays_named_on_the_others(monkeypatch
         make_log(np.random.default_rng(2).standard_normal((3, 6000)), rate=10.0, unit="deg/h")
     )
     start = initial_state(blocks, calibrate_noise(blocks))
-    white = Variant({}, ("white",), np.ones((1, 1, *start.weight.shape[1:])), squared=True)
+    white = Variant({}, ("white",), np.ones((1, 1, *start.expected_power.shape[1:])), squared=True)
     candidate = Candidate("vibration_noise", find_statistic("power"), ("vibration",), (white,))
     components = tuple(
         Component(candidate, white, (axis,), nats)
@@ -60,7 +61,7 @@ def test_noise_that_fluctuates_on_one_axis_stays_named_on_the_others(monkeypatch
     )
     selection = Selection("vibration_noise", ("vibration",), ("x", "y", "z"), components, 227.0, 8)
     monkeypatch.setattr(
-        withdrawal, "variance_fluctuation", lambda state, axis: 20.0 if axis == "x" else 0.0
+        withdrawal, "measure_fluctuation", lambda state, axis: 20.0 if axis == "x" else 0.0
     )
     examination = Examination(
         [], fold_blocks(blocks), CountEvidence({}), 8.0, start, (), np.zeros(1), {}
@@ -99,8 +100,8 @@ def test_masked_blocks_do_not_count() -> None:
     burst[20:40] = 1.5
     blocks = record(burst)
     state = initial_state(blocks, calibrate_noise(blocks))
-    assert variance_fluctuation(state, "x") > 8.0
-    assert variance_fluctuation(replace(state, masked=(burst > 1.0)[None]), "x") < 2.0
+    assert measure_fluctuation(state, "x") > 8.0
+    assert measure_fluctuation(replace(state, masked=(burst > 1.0)[None]), "x") < 2.0
 
 
 @pytest.mark.slow
@@ -114,7 +115,7 @@ def test_smooth_effect_that_stands_for_bursts_is_withdrawn() -> None:
     baseline, records = nulls(blocks, 40)
     identifications = name_effects(blocks, baseline, records)
     assert not identifications.identified
-    assert identifications.unknown
+    assert identifications.unidentified
     steady = record(np.linspace(0.9, 1.15, BLOCKS))
     baseline, records = nulls(steady, 40)
     assert [
@@ -157,5 +158,5 @@ def test_an_axis_that_turns_without_a_channel_has_no_jump_and_no_ageing():
     blocks = reduce_log(make_log(noise, rate=10.0, unit="deg/h", axis=["y"]))
     identifications = name_effects(blocks, *nulls(blocks, 10))
     assert not identifications.identified
-    assert "~red" in {unidentified.effect for unidentified in identifications.unknown}
-    assert {unidentified.axes for unidentified in identifications.unknown} == {("y",)}
+    assert "~red" in {unidentified.effect for unidentified in identifications.unidentified}
+    assert {unidentified.axes for unidentified in identifications.unidentified} == {("y",)}

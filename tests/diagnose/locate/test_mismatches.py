@@ -164,7 +164,7 @@ def test_pieces_of_one_region_are_merged_and_others_are_not():
         "statistic": "power",
         "view": "davar",
         "axes": "x",
-        "what": "avar",
+        "quantity": "avar",
         "begin": 0.0,
         "end": 100.0,
         "tau_min_s": 0.01,
@@ -186,7 +186,7 @@ def test_pieces_of_one_region_are_merged_and_others_are_not():
     line = region | {
         "statistic": "spectral_line",
         "view": "spectrum",
-        "what": "line",
+        "quantity": "line",
         "frequency": 13.35,
         "tau_min_s": 0.028,
         "tau_max_s": 0.028,
@@ -326,7 +326,7 @@ def test_effects_in_samples_are_located(raw, effect, statistic, axes, begin, end
         assert first["frequency"] == pytest.approx(13.37, abs=0.06)
         assert first["estimate"] == pytest.approx(0.15, rel=0.15)
     if effect is _add_spikes:
-        assert first["what"] == "outliers"
+        assert first["quantity"] == "outliers"
 
 
 def test_samples_without_an_effect_have_no_region(raw):

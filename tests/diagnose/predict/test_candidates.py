@@ -19,7 +19,7 @@ from gyrostab.diagnose.predict.linear_model import (
 from gyrostab.diagnose.predict.windows import hat_functions, make_windows
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import STATISTICS
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.ingest.make_log import make_log
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.registry import effects

@@ -17,7 +17,7 @@ from gyrostab.diagnose.predict.windows import (
     select_step_times,
 )
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.physics.prediction import Windows
 from gyrostab.physics.registry import make_effect
 from gyrostab.simulate import simulate

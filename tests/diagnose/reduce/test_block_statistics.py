@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from gyrostab.diagnose.reduce.block_statistics import block_samples, noise_at_orders, reduce_log
+from gyrostab.diagnose.reduce.block_statistics import choose_block_length, reduce_log
+from gyrostab.diagnose.reduce.rotation_orders import noise_at_orders
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.spectra.periodogram import band_covariance, band_edges, ordinates, taper
@@ -515,11 +516,11 @@ def test_an_angle_log_gives_the_statistics_of_its_rates():
 
 
 def test_block_length_depends_on_the_record():
-    assert block_samples(5 * 3600 * 400, 400.0) == 8000
-    days = block_samples(200 * 3600 * 400, 400.0)
+    assert choose_block_length(5 * 3600 * 400, 400.0) == 8000
+    days = choose_block_length(200 * 3600 * 400, 400.0)
     assert 200 * 3600 * 400 / days == pytest.approx(1000, rel=0.05)
-    assert 7_400 / block_samples(7_400, 200.0) >= 24
-    assert block_samples(360_000, 99.3) in range(1900, 1987)
+    assert 7_400 / choose_block_length(7_400, 200.0) >= 24
+    assert choose_block_length(360_000, 99.3) in range(1900, 1987)
 
 
 def test_error_for_a_short_record_states_the_minimum():

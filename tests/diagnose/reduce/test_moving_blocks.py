@@ -10,20 +10,21 @@ import xarray as xr
 
 from gyrostab import diagnose
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.estimate.unexplained_motion import unexplained_motion
+from gyrostab.diagnose.estimate.unexplained_motion import find_unexplained_motion
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.windows import make_windows
-from gyrostab.diagnose.reduce.block_statistics import measured, reduce_log
+from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.moving_blocks import (
-    moving_blocks,
-    moving_blocks_of_axis,
+    find_moving_blocks,
+    find_moving_blocks_of_axis,
     without_motion,
 )
+from gyrostab.diagnose.reduce.schema import read_as_measured
 from gyrostab.diagnose.result.tables import motion_mismatches
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate
@@ -53,20 +54,20 @@ def turning(at_rest) -> xr.Dataset:
 @pytest.fixture(scope="module")
 def reduced(turning) -> tuple[xr.Dataset, xr.Dataset]:
     whole = reduce_log(turning)
-    return whole, without_motion(turning, whole, moving_blocks(whole))
+    return whole, without_motion(turning, whole, find_moving_blocks(whole))
 
 
 def test_noise_and_drift_are_not_motion(at_rest):
-    assert not moving_blocks(reduce_log(at_rest)).any()
+    assert not find_moving_blocks(reduce_log(at_rest)).any()
     ramp = np.linspace(0.0, 500.0, at_rest.sizes["time"])
-    assert not moving_blocks(
+    assert not find_moving_blocks(
         reduce_log(at_rest.assign(rate=at_rest["rate"] + xr.DataArray(ramp, dims="time")))
     ).any()
 
 
 def test_moving_blocks_of_a_rotating_axis_are_found(reduced):
     whole, _ = reduced
-    moving = moving_blocks(whole)
+    moving = find_moving_blocks(whole)
     length = whole.attrs["block_samples"]
     assert not moving[:2].any()
     inside = np.flatnonzero(moving[2])
@@ -80,9 +81,9 @@ def test_motion_is_found_where_all_means_at_rest_are_equal(share):
     """Few samples a quantization step away from all others are no motion."""
     rng = np.random.default_rng(1)
     rate = (rng.random((1, 12_000)) < share).astype(float)
-    assert not moving_blocks(reduce_log(make_log(rate, rate=10.0, unit="deg/h"))).any()
+    assert not find_moving_blocks(reduce_log(make_log(rate, rate=10.0, unit="deg/h"))).any()
     rate[0, 4000:6000] += 500.0 + rng.standard_normal(2000)
-    moving = moving_blocks(reduce_log(make_log(rate, rate=10.0, unit="deg/h")))[0]
+    moving = find_moving_blocks(reduce_log(make_log(rate, rate=10.0, unit="deg/h")))[0]
     assert moving[32:46].all()
     assert not moving[:28].any()
 
@@ -92,7 +93,7 @@ def test_axis_that_mostly_rotates_needs_a_stretch_at_rest(at_rest, rest, found):
     rate = at_rest["rate"].transpose("axis", "time").values.copy()
     rate[2, rest:] += 400.0 * np.arange(rate.shape[1] - rest) / 1000.0
     blocks = reduce_log(at_rest.assign(rate=(("axis", "time"), rate, at_rest["rate"].attrs)))
-    moving, begin = moving_blocks(blocks), blocks["begin"].values
+    moving, begin = find_moving_blocks(blocks), blocks["begin"].values
     assert not moving[:2].any()
     assert moving[2].any() == found
     if found:
@@ -104,7 +105,7 @@ def test_axis_that_mostly_rotates_needs_a_stretch_at_rest(at_rest, rest, found):
 def test_random_walk_is_not_motion(blocks):
     walks = np.random.default_rng(1).standard_normal((40, blocks)).cumsum(axis=1)
     assert not any(
-        moving_blocks_of_axis(walk, float(np.ptp(walk)), DEFAULTS).any() for walk in walks
+        find_moving_blocks_of_axis(walk, float(np.ptp(walk)), DEFAULTS).any() for walk in walks
     )
 
 
@@ -114,8 +115,8 @@ def test_motion_is_left_out_on_its_axis_and_kept_as_measured(reduced):
     assert np.isnan(rest["mean"].values[moving]).all()
     assert np.isnan(rest["power"].values[moving]).all()
     np.testing.assert_array_equal(rest["mean"].values[:2], whole["mean"].values[:2])
-    np.testing.assert_array_equal(measured(rest, "mean"), whole["mean"])
-    np.testing.assert_array_equal(measured(rest, "cross"), whole["cross"])
+    np.testing.assert_array_equal(read_as_measured(rest, "mean"), whole["mean"])
+    np.testing.assert_array_equal(read_as_measured(rest, "cross"), whole["cross"])
     np.testing.assert_array_equal(make_windows(rest, {}).own["z"], whole["mean"].sel(axis="z"))
     assert rest.sizes["gap"] == whole.sizes["gap"]
 
@@ -164,16 +165,16 @@ def identification(
 
 def test_effect_explains_motion_if_it_leaves_almost_nothing(reduced, state):
     whole, _ = reduced
-    moving = moving_blocks(whole)
+    moving = find_moving_blocks(whole)
     bump = np.nan_to_num(whole["mean"].values[2] - np.nanmedian(whole["mean"].values[2]))
-    assert not unexplained_motion(
+    assert not find_unexplained_motion(
         whole, [identification("warm_up", "mean", "z", course=0.1 * np.abs(bump) ** 1.1)], state
     ).any()
     for other in (
         identification("rotation_line", "rotation_order", "z"),
         identification("dead_zone", "sample_counts", "z", column="stuck"),
     ):
-        assert not unexplained_motion(whole, [other], state).any()
+        assert not find_unexplained_motion(whole, [other], state).any()
     step = np.where(np.arange(bump.size) < np.flatnonzero(moving[2]).mean(), 0.0, 1.0)
     for other in (
         identification("bias_jump", "mean", "z", course=step),
@@ -182,24 +183,24 @@ def test_effect_explains_motion_if_it_leaves_almost_nothing(reduced, state):
         identification("vibration_random_walk", "random_process", "z"),
         identification("held_samples", "sample_counts", "z", column="repeats"),
     ):
-        np.testing.assert_array_equal(unexplained_motion(whole, [other], state), moving)
+        np.testing.assert_array_equal(find_unexplained_motion(whole, [other], state), moving)
 
 
 def test_outliers_explain_motion_in_their_blocks_only(reduced, state):
     whole, _ = reduced
-    moving = moving_blocks(whole)
+    moving = find_moving_blocks(whole)
     spikes = identification("spikes", "sample_counts", "z", column="outliers")
     for in_blocks in (moving[2], moving[2] & (np.arange(moving.shape[1]) % 2 == 0)):
         counts = whole["outliers"].copy()
         counts[2] = np.where(in_blocks, 5, 0)
-        left = unexplained_motion(whole.assign(outliers=counts), [spikes], state)
+        left = find_unexplained_motion(whole.assign(outliers=counts), [spikes], state)
         np.testing.assert_array_equal(left, moving & (in_blocks != moving[2]).any())
 
 
 def test_several_steps_do_not_explain_a_slow_motion(reduced, state):
     """Enough of them leave next to nothing of it, but not an axis at rest."""
     whole, _ = reduced
-    inside = np.flatnonzero(moving_blocks(whole)[2])
+    inside = np.flatnonzero(find_moving_blocks(whole)[2])
     steps = [
         identification(
             "bias_jump",
@@ -210,8 +211,8 @@ def test_several_steps_do_not_explain_a_slow_motion(reduced, state):
         )
         for at in inside[::2]
     ]
-    left = unexplained_motion(whole, steps, state)
-    np.testing.assert_array_equal(left, moving_blocks(whole))
+    left = find_unexplained_motion(whole, steps, state)
+    np.testing.assert_array_equal(left, find_moving_blocks(whole))
 
 
 def test_motion_ends_where_the_axis_is_at_rest_again(at_rest):
@@ -220,7 +221,7 @@ def test_motion_ends_where_the_axis_is_at_rest_again(at_rest):
     log = at_rest.copy(deep=True)
     log["rate"].loc[{"axis": "z"}] += xr.DataArray(hump, dims="time")
     whole = reduce_log(log)
-    moving = moving_blocks(whole)[2]
+    moving = find_moving_blocks(whole)[2]
     mean, length = whole["mean"].values[2], whole.attrs["block_samples"]
     scatter = float(np.std(reduce_log(at_rest)["mean"].values[2]))
     assert moving.any()
@@ -242,7 +243,7 @@ def test_channel_explains_motion_if_it_sees_almost_all_of_its_power(at_rest, see
     log["rate"].loc[{"axis": "z"}] += xr.DataArray(motion, dims="time")
     log["seismometer"] = ("time", seen_motion, {"units": "m s-1"})
     whole = reduce_log(log)
-    moving = moving_blocks(whole)
+    moving = find_moving_blocks(whole)
     baseline = calibrate_noise(without_motion(log, whole, moving))
     candidate = next(
         candidate
@@ -251,20 +252,20 @@ def test_channel_explains_motion_if_it_sees_almost_all_of_its_power(at_rest, see
     )
     component = Component(candidate, candidate.variants[-1], ("z",), 100.0)
     named = [SimpleNamespace(effect="real_motion", components=(component,))]
-    left = unexplained_motion(whole, named, initial_state(whole, baseline))
+    left = find_unexplained_motion(whole, named, initial_state(whole, baseline))
     np.testing.assert_array_equal(left, moving & (seen < 1.0))
 
 
 def test_identified_jump_is_not_motion(at_rest, state):
     step = np.where(np.arange(at_rest.sizes["time"]) < 8000, 0.0, 300.0)
     whole = reduce_log(at_rest.assign(rate=at_rest["rate"] + xr.DataArray(step, dims="time")))
-    assert moving_blocks(whole).any(axis=1).all()
+    assert find_moving_blocks(whole).any(axis=1).all()
     block_count = whole["begin"].values * 10.0 >= 8000
     named = [
         identification("bias_jump", "mean", axis, course=block_count.astype(float))
         for axis in "xyz"
     ]
-    assert not unexplained_motion(whole, named, state).any()
+    assert not find_unexplained_motion(whole, named, state).any()
 
 
 def test_two_levels_explain_motion_only_if_they_leave_the_axis_at_rest(at_rest, state):
@@ -278,13 +279,13 @@ def test_two_levels_explain_motion_only_if_they_leave_the_axis_at_rest(at_rest, 
             reduce_log(at_rest.assign(rate=at_rest["rate"] + xr.DataArray(added, dims="time")))
             for added in (hump, steps)
         )
-        moving = moving_blocks(whole)
+        moving = find_moving_blocks(whole)
         assert moving.any(axis=1).all()
         named = [
             identification("telegraph", "telegraph", axis, course=levels["mean"].values[row])
             for row, axis in enumerate("xyz")
         ]
-        left = unexplained_motion(whole, named, state)
+        left = find_unexplained_motion(whole, named, state)
         np.testing.assert_array_equal(left, moving & (rise > 1))
 
 
@@ -293,7 +294,7 @@ def test_rest_is_found_in_less_than_half_of_the_time(at_rest):
     rate = log["rate"].transpose("axis", "time").values
     rate[2, 2000:9000] += 400.0 * np.sin(np.pi * np.linspace(0.0, 3.0, 7000)) ** 2
     whole = reduce_log(log.assign(rate=(("axis", "time"), rate, log["rate"].attrs)))
-    moving = moving_blocks(whole)
+    moving = find_moving_blocks(whole)
     assert not moving[:2].any()
     seconds = whole["begin"].values
     turning = (seconds >= 205.0) & (seconds < 880.0)
@@ -325,7 +326,7 @@ def sparse_at_rest(turning) -> xr.Dataset:
 def test_too_few_samples_at_rest_cannot_be_calibrated(sparse_at_rest):
     whole = reduce_log(sparse_at_rest)
     with pytest.raises(SchemaError, match="axis z"):
-        calibrate_noise(without_motion(sparse_at_rest, whole, moving_blocks(whole)))
+        calibrate_noise(without_motion(sparse_at_rest, whole, find_moving_blocks(whole)))
 
 
 @pytest.mark.slow

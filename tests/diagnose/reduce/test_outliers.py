@@ -13,13 +13,13 @@ from gyrostab.diagnose.reduce.outliers import (
     find_peaks,
     quantization_step,
 )
-from gyrostab.kernels.spectra.outliers import HISTOGRAM, departures
+from gyrostab.kernels.samples.outliers import HISTOGRAM, departures
 
 SIZE, BLOCK, RATE = 18_000, 180, 10.0  # half an hour
 
 
 def counted(x: np.ndarray, block: int = BLOCK) -> tuple[np.ndarray, np.ndarray]:
-    """Return peaks and outliers by block, of one axis."""
+    """Return number and weighted number of outliers by block, of one axis."""
     values = np.ascontiguousarray(x[: x.size // block * block].reshape(-1, block))
     histogram = np.zeros((1, len(values), HISTOGRAM), np.uint32)
     number, outliers = count_outliers(histogram, [[find_peaks(values, histogram[0])]])

@@ -154,7 +154,7 @@ def test_weak_sine_is_named_with_frequency_and_amplitude():
     blocks = reduce_log(make_log(noise, rate=RATE, unit="deg/h"))
     identified = name_effects(blocks, *nulls(blocks, 20)).identified
     assert [identification.effect for identification in identified] == ["spectral_line"]
-    place = identified[0].components[0].place
+    place = identified[0].components[0].line_index
     (size, stderr), (frequency, error) = estimate_line(blocks, "x", place)
     assert abs(size - amplitude) < 3.0 * stderr < 0.5 * amplitude
     assert abs(frequency - 1.7321) < 2.0 * error < 0.002

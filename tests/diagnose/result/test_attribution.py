@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
-from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.locate.mismatches import locate_mismatches, merge_regions
 from gyrostab.diagnose.nulls.scores import null_scores
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
-from gyrostab.diagnose.predict.condition import MIN_POWER_RATIO, condition_on, fit_powers
+from gyrostab.diagnose.predict.condition import MIN_FITTED_POWER_RATIO, condition_on, fit_powers
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.result.attribution import (
     active_blocks,
@@ -21,7 +21,7 @@ from gyrostab.diagnose.result.attribution import (
     needed_effects,
 )
 from gyrostab.diagnose.statistics import find_statistic
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.diagnose.statistics.sample_counts import find_anomalous_blocks
 from tests.support.candidates import make_identifications, select_candidate
 from tests.support.named import COEFFICIENT, WORLD, nulls, record
@@ -158,14 +158,14 @@ def test_jump_explains_the_mean_on_either_side(shaken, step, attributed):
         "statistic": "mean",
         "view": "mean",
         "axes": "x",
-        "what": "mean",
+        "quantity": "mean",
         "begin": 1200.0,
         "end": 1800.0,
         "tau_min_s": 20.0,
         "tau_max_s": 600.0,
     }
     region |= {"frequency": np.nan, "sign": -1, "z": -8.0}
-    assert find_statistic("mean").score(moved, baseline)["what"].values.tolist() == ["mean"]
+    assert find_statistic("mean").score(moved, baseline)["quantity"].values.tolist() == ["mean"]
 
     def explained(**options):
         return attribute_mismatches(
@@ -185,7 +185,7 @@ def test_jump_explains_the_mean_on_either_side(shaken, step, attributed):
     )
 
 
-BOX = {"view": "davar", "axes": "x", "what": "level", "z": 20.0}
+BOX = {"view": "davar", "axes": "x", "quantity": "level", "z": 20.0}
 
 
 def _make_shown(*statistics):
@@ -250,7 +250,7 @@ def test_short_mismatch_is_merged_only_with_a_near_long_one(begin, regions):
         "statistic": "power",
         "view": "davar",
         "axes": "x y",
-        "what": "level",
+        "quantity": "level",
         "begin": 100.0,
         "end": 400.0,
         "tau_min_s": 0.01,
@@ -299,14 +299,16 @@ def test_leaving_out_power_that_was_fitted_below_zero_adds_none(shaken):
     """The least power bounds what remains, and not the sum from which the share is taken."""
     blocks, baseline, _, _ = shaken
     state = initial_state(blocks, baseline)
-    level, part = state.weight[0], np.zeros((blocks.sizes["block"], 1))
+    level, part = state.expected_power[0], np.zeros((blocks.sizes["block"], 1))
     part[:18], part[18:20] = 1.0, 100.0
     power = blocks["power"].copy()
     power[0, :18], power[0, 18:20] = 0.5 * level[:18], np.nan  # the share is negative
     state = replace(state, blocks=state.blocks.assign(power=power))
     state = state.with_columns("power", "x", [level * part])
     whole, without = fit_powers(state, "x"), fit_powers(state, "x", np.array([True]))
-    np.testing.assert_allclose(whole[18:20], MIN_POWER_RATIO * state.weight[0, 18:20])
+    np.testing.assert_allclose(
+        whole[18:20], MIN_FITTED_POWER_RATIO * state.expected_power[0, 18:20]
+    )
     np.testing.assert_allclose(without[:20] / without[20:40], 1.0, atol=0.2)
 
 
@@ -361,7 +363,7 @@ def turning():
 def identification(blocks, effect, statistic):
     candidates, _ = effect_candidates(blocks, COEFFICIENT)
     candidate = select_candidate(candidates, effect, statistic)
-    component = Component(candidate, candidate.variants[0], ("x",), 50.0, place=0)
+    component = Component(candidate, candidate.variants[0], ("x",), 50.0, line_index=0)
     return Selection(effect, candidate.driver, ("x",), (component,), 50.0, 8.0)
 
 

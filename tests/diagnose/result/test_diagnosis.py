@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.diagnose.result.content import VERDICTS, check_diagnosis, make_schema
-from gyrostab.diagnose.result.diagnosis import Diagnosis, effect_table, model_text, plain
+from gyrostab.diagnose.result.diagnosis import Diagnosis, effect_table, model_text, to_json_types
 from gyrostab.diagnose.result.record_text import summary
 from gyrostab.diagnose.result.text import (
     chance,
@@ -145,7 +145,9 @@ def test_contradictions_are_errors(change, complaint: str):
 def test_json_has_null_for_infinities():
     assert json.loads(
         json.dumps(
-            plain({"a": np.array([1.0, np.inf]), "b": np.bool_(True), "c": (np.float32(2),)})
+            to_json_types(
+                {"a": np.array([1.0, np.inf]), "b": np.bool_(True), "c": (np.float32(2),)}
+            )
         )
     ) == {
         "a": [1.0, None],
@@ -248,7 +250,7 @@ def test_folder_of_four_files_round_trips(tmp_path: Path):
 @plain_pages
 def test_a_file_name_that_is_no_text_is_replaced(tmp_path: Path):
     made = {**content(), "recording": {**content()["recording"], "files": ["a\udcff\x01.csv"]}}
-    write_diagnosis(Diagnosis(plain(made), surfaces(), model()), tmp_path / "found")
+    write_diagnosis(Diagnosis(to_json_types(made), surfaces(), model()), tmp_path / "found")
     assert open_diagnosis(tmp_path / "found").content["recording"]["files"] == ["a?\x01.csv"]
 
 
@@ -432,14 +434,14 @@ def test_every_effect_has_a_plain_name_and_a_next_measurement():
         ("ramp_phase", "order 2"),
         ("sample_counts", "outliers"),
         ("restart", "jump"),
-        ("variance_stability", "variance 20 s"),
+        ("variance_fluctuation", "variance 20 s"),
         ("drifting_line", "drifting 1 2"),
     ],
 )
 @pytest.mark.parametrize("axes", [["x"], ["x", "y"]])
 def test_every_statistic_has_a_sentence(statistic: str, detail: str, axes: list[str]):
     region = {
-        "statistic": statistic, "what": detail, "axes": axes, "begin": 0.0, "end": 3600.0,
+        "statistic": statistic, "quantity": detail, "axes": axes, "begin": 0.0, "end": 3600.0,
         "tau_min_s": 0.01, "tau_max_s": 0.01, "ratio": 2.0,
         "sign": -1, "p_value": 0.002, "estimate": -0.2, "frequency": 13.0,
     }  # fmt: skip

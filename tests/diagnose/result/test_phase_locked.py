@@ -9,9 +9,9 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
-from gyrostab.diagnose.result.held_out import remove_phase_locked
+from gyrostab.diagnose.result.held_out_table import remove_phase_locked
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.simulate import simulate
 from tests.support.candidates import make_identifications

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.result.rejections import Rejection, find_unsupported, rejected_tables
 
 

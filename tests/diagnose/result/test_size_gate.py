@@ -19,7 +19,7 @@ import gyrostab
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import Estimate, Fitted, fit_identifications
 from gyrostab.diagnose.evidence.mixture import Mixture
-from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.predict.candidates import Candidate, Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.result import finish as conclude
@@ -92,7 +92,8 @@ def test_line_of_zero_amplitude_is_not_an_effect():
     )
     assert not identifications.identified
     assert [
-        (unidentified.axes, unidentified.alternatives) for unidentified in identifications.unknown
+        (unidentified.axes, unidentified.alternatives)
+        for unidentified in identifications.unidentified
     ] == [(("x",), ("spectral_line",))]
 
 
@@ -124,7 +125,7 @@ def test_effect_keeps_axes_with_a_size():
     assert supported.evidence_nats < identification.evidence_nats
     assert supported.instead == {"shupe": supported.evidence_nats - 2.0}  # on the same axes
     assert [
-        (unidentified.axes, unidentified.effect) for unidentified in identifications.unknown
+        (unidentified.axes, unidentified.effect) for unidentified in identifications.unidentified
     ] == [(("y",), "~bias(t)")]
     assert keep_supported(before, [numbers[0][:1], numbers[1]]).identified[0].axes == ("x",)
     assert keep_supported(identifications, [numbers[0][:1], numbers[1]]) is identifications
@@ -140,7 +141,7 @@ def test_unsupported_rest_below_the_threshold_is_dropped():
     ]
     identifications = keep_supported(make_identifications([identification]), numbers)
     assert [identification.axes for identification in identifications.identified] == [("x",)]
-    assert not identifications.unknown
+    assert not identifications.unidentified
 
 
 def test_effect_of_possibly_zero_size_becomes_unidentified():
@@ -282,7 +283,7 @@ def test_only_lasting_effects_are_forecast(points: list[list[float]], has_foreca
     identifications = identify_by_hand(
         blocks, baseline, "vibration_noise", "power", ("white",), exponent=1.0
     )
-    held = conclude.measure_evidence(
+    held = conclude.measure_held_out(
         blocks, baseline, identifications, fit_identifications(identifications, baseline)
     )
     assert math.isfinite(held["forecast_gain"]) == has_forecast
@@ -323,7 +324,7 @@ def test_noise_that_is_over_does_not_spoil_the_forecast_of_another_effect():
         identified=(*vibration.identified, *warmth.identified),
         state=condition_on(vibration.state, list(warmth.identified[0].components)),
     )
-    held = conclude.measure_evidence(blocks, baseline, both, fit_identifications(both, baseline))
+    held = conclude.measure_held_out(blocks, baseline, both, fit_identifications(both, baseline))
     assert held["forecast_gain"] > 0.0
 
 

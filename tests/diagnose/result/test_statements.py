@@ -16,7 +16,7 @@ from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.diagnose.result.record_text import summary
 from gyrostab.diagnose.result.tables import effect_tables
-from gyrostab.diagnose.statistics.wording import COARSE_ANGLE_GRID
+from gyrostab.diagnose.statistics.mismatch_wording import COARSE_ANGLE_GRID
 from gyrostab.ingest.make_log import make_log
 from gyrostab.physics.registry import make_effect
 from tests.support.diagnosed import content, model, surfaces

@@ -201,7 +201,7 @@ def test_common_motion_is_one_region_explained_by_its_effect(base, null):
         record=0
     )
     regions = locate_mismatches(blocks, base, null)
-    assert [(region["view"], region["what"]) for region in regions] == [("cross_axis", "slow")]
+    assert [(region["view"], region["quantity"]) for region in regions] == [("cross_axis", "slow")]
     assert set(regions[0]["axes"].split()) == {"x", "y", "z"}
     message = mismatch_statement(regions[0] | {"axes": ["x", "y", "z"]}, BLOCKS * BLOCK_S)
     assert message.startswith("Axes x, y and z drift together (correlation 0.")
@@ -226,13 +226,16 @@ def test_common_motion_is_separate_from_common_noise_within_blocks():
         "statistic": "common_mode",
         "view": "cross_axis",
         "axes": "x y z",
-        "what": "slow",
+        "quantity": "slow",
         "begin": 0.0,
         "end": 3600.0,
         "tau_min_s": 20.0,
         "tau_max_s": 1800.0,
     }
     slow |= {"frequency": float("nan"), "sign": 1, "z": 9.0, "p_value": 1e-6}
-    fast = slow | {"what": "all in phase", "tau_min_s": 0.01, "tau_max_s": 20.0}
-    assert [region["what"] for region in merge_regions([slow, fast])] == ["slow", "all in phase"]
+    fast = slow | {"quantity": "all in phase", "tau_min_s": 0.01, "tau_max_s": 20.0}
+    assert [region["quantity"] for region in merge_regions([slow, fast])] == [
+        "slow",
+        "all in phase",
+    ]
     assert len(merge_regions([slow, slow | {"axes": "x y", "tau_min_s": 40.0}])) == 1

@@ -19,7 +19,7 @@ from gyrostab.diagnose.predict.sizes import component_mixture, mean_mixture
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.tables import effect_tables
 from gyrostab.diagnose.statistics.base import SizeFit
-from gyrostab.diagnose.statistics.candidates import effect_candidates
+from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.diagnose.statistics.jump_forms import is_free_jump
 from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate

@@ -223,7 +223,7 @@ def test_a_step_raises_the_allan_variance_by_the_closed_form():
     surface = davar.allan_surface(blocks, base)
     whole = surface["windows"].length == block_count
     for column, tau in enumerate(surface["columns"]["tau_min_s"]):
-        if tau >= 4 * BLOCK_S and surface["columns"]["what"][column] == "avar":
+        if tau >= 4 * BLOCK_S and surface["columns"]["quantity"][column] == "avar":
             # D^2 tau / (3 (W - 2 tau)), its sum over whole blocks
             expected = height**2 * tau / (3.0 * (block_count * BLOCK_S - 2.0 * tau))
             assert surface["observed"][0, whole, column] == pytest.approx(expected, rel=0.05)
@@ -275,7 +275,7 @@ def test_phase_locked_rates_are_detected(base):
     blocks["channel_rotation_rate"] = ("block", np.full(block_count, 720.0))
     scores = find_statistic("ramp_phase").score(blocks, base)
     z = scores["z"].values
-    assert scores["what"].values.tolist() == ["order 1", "order 2", "order 3", "ramp phase"]
+    assert scores["quantity"].values.tolist() == ["order 1", "order 2", "order 3", "ramp phase"]
     assert np.allclose(z.std(axis=(0, 1, 2)), 1.0, atol=0.1)
     assert np.all(z.mean(axis=(0, 1, 2)) < 0.15)
     blocks["order"][:, 0, :, 1] += 0.05 * np.exp(0.4j)
@@ -322,7 +322,7 @@ def test_sample_counts_and_tails_are_detected(base):
     blocks["outliers"][1, 0, 40:43] = 2
     blocks["kurtosis"][1, 2, 90:120] += 0.5
     scores = find_statistic("sample_counts").score(blocks, base)
-    of = scores["what"].values.tolist().index
+    of = scores["quantity"].values.tolist().index
     z = scores["z"].values
     short = scores["stop"].values - scores["first"].values == 5
     best = int(np.argmax(np.where(short, z[1, 0, :, of("outliers")], -1.0)))

@@ -9,8 +9,8 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.result import held_out as evidence
-from gyrostab.diagnose.result.held_out import cut_stretches, log_likelihood
+from gyrostab.diagnose.result import held_out_table
+from gyrostab.diagnose.result.held_out_table import cut_stretches, log_likelihood
 from gyrostab.diagnose.result.surfaces import CASES, make_surfaces
 from gyrostab.noise import LAWS
 from gyrostab.simulate import simulate
@@ -27,8 +27,8 @@ def held_out(blocks, *models, **others):
     models = [model if callable(model) else lambda known, model=model: model for model in models]
     if "shown" in others:
         others["shown"] = lambda known, model=others["shown"]: model
-    others = {"more_gain": 0.0, "shown": models[1], "forecast": models[1]} | others
-    return evidence.held_out(blocks, *models, **others)
+    others = {"added_nats": 0.0, "shown": models[1], "forecast": models[1]} | others
+    return held_out_table.held_out(blocks, *models, **others)
 
 
 def _record(seed=1, **options):
@@ -169,7 +169,9 @@ def test_models_are_not_fitted_to_held_out_blocks():
 def test_noise_is_calibrated_without_held_out_blocks(monkeypatch):
     models = []
     monkeypatch.setattr(
-        evidence, "held_out", lambda blocks, before, after, **others: models.append((before, after))
+        held_out_table,
+        "held_out",
+        lambda blocks, before, after, **others: models.append((before, after)),
     )
     model = {"log": {"axes": ["x"]}, "noise": {"N": 0.003, "B": 0.001}}
     blocks = reduce_log(simulate(model, duration="20min", rate=10.0, seed=1).compute())
@@ -181,7 +183,7 @@ def test_noise_is_calibrated_without_held_out_blocks(monkeypatch):
     for either in (blocks, louder):
         base = calibrate_noise(either, quiet=(0.0, 1200.0))
         found = identify_by_hand(either, base, "ageing_bias", "mean", ("slope",))
-        evidence.measure_evidence(either, base, found, fit_identifications(found, base))
+        held_out_table.measure_held_out(either, base, found, fit_identifications(found, base))
         spectra.append([model(known)["spectrum"].values for model in models.pop()])
     for of_blocks, of_louder in zip(*spectra, strict=True):
         np.testing.assert_allclose(of_louder[:, known], of_blocks[:, known], rtol=1e-12)
@@ -242,7 +244,7 @@ def test_forecast_gains_if_the_effect_continues():
 
 def test_gain_of_other_statistics_is_added():
     base, blocks = _record()
-    result = held_out(blocks, base, base, more_gain=3.5)
+    result = held_out(blocks, base, base, added_nats=3.5)
     assert (result["log_likelihood_gain"], result["stderr"]) == (3.5, pytest.approx(np.sqrt(7.0)))
 
 
@@ -251,8 +253,8 @@ def test_allan_variance_is_compared_with_the_shown_model():
     _add_effects(blocks, epsilon=0.5)
     whole = _with_effects(base, epsilon=0.5)
     with_model, blind = (
-        held_out(blocks, base, base, more_gain=3.5, shown=whole),
-        held_out(blocks, base, base, more_gain=3.5),
+        held_out(blocks, base, base, added_nats=3.5, shown=whole),
+        held_out(blocks, base, base, added_nats=3.5),
     )
     assert with_model["log_likelihood_gain"] == blind["log_likelihood_gain"] == pytest.approx(3.5)
     assert abs(with_model["misfit_after"] - 1.0) < 0.3 * abs(blind["misfit_after"] - 1.0)

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Array, Bools, Floats
-from gyrostab.diagnose.baseline.calibrate import calibrate_on_known
+from gyrostab.diagnose.baseline.calibrate import calibrate_on_training_blocks
 from gyrostab.diagnose.baseline.expected_statistics import reduced_shape
 from gyrostab.diagnose.estimate.conditioned_baseline import expected_baseline, predict_baseline
 from gyrostab.diagnose.estimate.joint_fit import Fitted
@@ -21,15 +21,15 @@ from gyrostab.diagnose.evidence.folds import FOLDS, fold_blocks
 from gyrostab.diagnose.evidence.held_out import mean_residual, noise_weight
 from gyrostab.diagnose.evidence.mixture import products_mixture
 from gyrostab.diagnose.evidence.products import axis_noise, mean_products
-from gyrostab.diagnose.identify.examination import Identifications
-from gyrostab.diagnose.identify.identification import Selection, components_of
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import Selection, components_of
 from gyrostab.diagnose.predict.candidates import Component
-from gyrostab.diagnose.reduce.block_statistics import pair_indices
+from gyrostab.diagnose.reduce.schema import pair_indices
 from gyrostab.diagnose.result.attribution import active_blocks
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
-from gyrostab.diagnose.statistics.scores import Windows, cube_root_score
+from gyrostab.diagnose.statistics.scores import BlockWindows, cube_root_score
 from gyrostab.noise import NORMAL_95
 
 #: Fits a baseline to the blocks where its argument, a mask, is true.
@@ -40,11 +40,11 @@ FORECAST_FROM_SHARE = 0.7  # share of the record that a forecast begins from
 SHORT_WINDOW_BLOCKS = 5  # length of the middle one of the three windows of the Allan variance
 
 
-def measure_evidence(
+def measure_held_out(
     blocks: xr.Dataset,
     baseline: xr.Dataset,
     identifications: Identifications,
-    first: Sequence[Fitted],
+    first_fit: Sequence[Fitted],
 ) -> dict[str, float]:
     """Measure what the effects gain on held-out data, with the noise fitted together with them.
 
@@ -52,9 +52,9 @@ def measure_evidence(
     random biases and phase-locked components are in none of these: their evidence is added.
     """
     with_course, random_nats = _remove_random_biases(identifications)
-    first = [
+    first_fit = [
         fitted
-        for fitted in first
+        for fitted in first_fit
         if not any(component.statistic.is_random_bias for component in fitted.components)
     ]
     judged, phase_locked_nats = remove_phase_locked(with_course, blocks)
@@ -71,32 +71,34 @@ def measure_evidence(
     )
 
     settings = identifications.state.settings
-    calibrated: dict[bytes, xr.Dataset] = {}  # by the known blocks
+    calibrated: dict[bytes, xr.Dataset] = {}  # by the training blocks
 
-    def calibrate(known: Bools) -> xr.Dataset:
-        place = known.tobytes()
+    def calibrate(training: Bools) -> xr.Dataset:
+        place = training.tobytes()
         if place not in calibrated:
-            calibrated[place] = calibrate_on_known(blocks, baseline, known, settings=settings)
+            calibrated[place] = calibrate_on_training_blocks(
+                blocks, baseline, training, settings=settings
+            )
         return calibrated[place]
 
-    def before(known: Bools) -> xr.Dataset:
-        return expected_baseline(with_course, calibrate(known), known)
+    def before(training: Bools) -> xr.Dataset:
+        return expected_baseline(with_course, calibrate(training), training)
 
     def train(
-        chosen: Identifications, known: Bools, is_left_out: Sequence[bool] = ()
+        chosen: Identifications, training: Bools, is_left_out: Sequence[bool] = ()
     ) -> xr.Dataset:
-        noise = recalibrate(chosen, calibrate(known), first, known)
+        noise = recalibrate(chosen, calibrate(training), first_fit, training)
         renewed = with_noise(chosen, noise)
         left_out = tuple(compress(renewed.identified, is_left_out))
-        return predict_baseline(renewed, noise, known, left_out=left_out)
+        return predict_baseline(renewed, noise, training, left_out=left_out)
 
     after = partial(train, judged) if judged.identified else before
     with_phase_locked = partial(train, with_course) if identified else before
-    known = select_forecast_start(blocks)
+    training = select_forecast_start(blocks)
     begun = tuple(
         identification
         for identification in judged.identified
-        if active_blocks(identification, blocks, settings=settings)[known].any()
+        if active_blocks(identification, blocks, settings=settings)[training].any()
     )
     # what is over later is not forecast, but is in the blocks that the noise is calibrated on
     is_over = [not _can_be_forecast(identification, blocks, settings) for identification in begun]
@@ -105,7 +107,7 @@ def measure_evidence(
         clean,
         before,
         after,
-        more_gain=count_nats + random_nats + phase_locked_nats,
+        added_nats=count_nats + random_nats + phase_locked_nats,
         shown=with_phase_locked if phase_locked_nats else after,
         forecast=partial(train, replace(judged, identified=begun), is_left_out=is_over)
         if has_forecast
@@ -165,12 +167,13 @@ def _can_be_forecast(identification: Selection, blocks: xr.Dataset, settings: Se
     if all(component.statistic.is_count for component in identification.components):
         return False
     acts = active_blocks(identification, blocks, settings=settings)
-    known = select_forecast_start(blocks)
+    training = select_forecast_start(blocks)
     has_later_step = any(
-        component.is_step and (np.ptp(component.variant.design[..., known], axis=-1) == 0.0).any()
+        component.is_step
+        and (np.ptp(component.variant.design[..., training], axis=-1) == 0.0).any()
         for component in identification.components
     )
-    return bool(acts[~known].any() and not has_later_step)
+    return bool(acts[~training].any() and not has_later_step)
 
 
 def held_out(
@@ -178,7 +181,7 @@ def held_out(
     before: FitBaseline,
     after: FitBaseline,
     *,
-    more_gain: float,
+    added_nats: float,
     shown: FitBaseline,
     forecast: FitBaseline,
 ) -> dict[str, float]:
@@ -186,7 +189,7 @@ def held_out(
 
     The record is cut into stretches. Every fourth is held out in turn, and the models are fitted to
     the rest. Models that differ in their means are also compared on stretches of all lengths of
-    `gyrostab.diagnose.evidence.folds`, as in the identification; the length with the largest gain
+    `gyrostab.diagnose.evidence.folds`, as in the identification; the length with the most evidence
     counts. Over a short gap, a random walk follows a slow drift from both sides, so that a model of
     the drift gains little there.
 
@@ -196,12 +199,12 @@ def held_out(
         Take the mask of the blocks that they may use, and return the baseline fitted to them, the
         second with the effects in its ``spectrum``, ``known_mean`` and, for noise in common,
         ``cross`` (pair, block, band).
-    more_gain : float
+    added_nats : float
         Held-out gain [nats] of what is in neither means nor powers nor cross-spectra, to be added:
         sample counts, phase-locked components, random biases. Lines whose phase wanders are in the
         powers of their bands already and would count twice.
     shown : callable
-        The same with all effects, those of `more_gain` included, for the Allan variance.
+        The same with all effects, those of `added_nats` included, for the Allan variance.
     forecast : callable
         The same with the effects that can be forecast.
 
@@ -217,31 +220,33 @@ def held_out(
     windows = cut_stretches(blocks)
     fold_of_window = np.arange(windows.first.size) % FOLDS
     stretches = np.repeat(fold_of_window, windows.length)
-    gains: list[Floats] = []
+    nats_by_length: list[Floats] = []
     moves = False
     squares: dict[str, list[Floats]] = {"before": [], "after": []}
     for fold in (stretches, *fold_blocks(blocks).values[1:]):
-        gain = np.array([more_gain, 2.0 * abs(more_gain)])
+        length_nats = np.array([added_nats, 2.0 * abs(added_nats)])
         for number in range(FOLDS):
             held = fold == number
             models = {"before": before(~held), "after": after(~held)}
-            gain = gain + _compare_models(blocks, models["before"], models["after"], held)
+            length_nats = length_nats + _compare_models(
+                blocks, models["before"], models["after"], held
+            )
             moves |= not models["after"]["known_mean"].equals(models["before"]["known_mean"])
-            if gains:
+            if nats_by_length:
                 continue  # the Allan variance is compared on the stretches
             if shown is not after:
                 models["after"] = shown(~held)
             chosen = fold_of_window == number
-            inside = Windows(windows.first[chosen], windows.stop[chosen])
+            inside = BlockWindows(windows.first[chosen], windows.stop[chosen])
             for name, baseline in models.items():
                 squares[name].append(_allan_scores(blocks, baseline, inside))
-        gains.append(gain)
+        nats_by_length.append(length_nats)
         if not moves:
             break
-    evidence_nats, variance = max(gain.tolist() for gain in gains)
-    known = select_forecast_start(blocks)
+    evidence_nats, variance = max(length_nats.tolist() for length_nats in nats_by_length)
+    training = select_forecast_start(blocks)
     late, early = (
-        log_likelihood(blocks, model(known), known, ~known) for model in (forecast, before)
+        log_likelihood(blocks, model(training), training, ~training) for model in (forecast, before)
     )
     return {
         "blocks": windows.first.size,
@@ -272,7 +277,7 @@ def _compare_models(
     return np.array([nats, variance])
 
 
-def cut_stretches(blocks: xr.Dataset) -> Windows:
+def cut_stretches(blocks: xr.Dataset) -> BlockWindows:
     """Cut a record into the stretches to hold out: 100 s long, shorter in records below an hour."""
     block_count = blocks.sizes["block"]
     span = block_count * float(blocks.attrs["block_s"])
@@ -281,23 +286,23 @@ def cut_stretches(blocks: xr.Dataset) -> Windows:
             0, block_count, min(block_count, max(MIN_STRETCHES, round(span / STRETCH_S))) + 1
         )
     ).astype(np.int64)
-    return Windows(edge[:-1], edge[1:])
+    return BlockWindows(edge[:-1], edge[1:])
 
 
-def log_likelihood(blocks: xr.Dataset, baseline: xr.Dataset, known: Bools, held: Bools) -> float:
-    """Return the log-likelihood of held-out blocks given the known blocks [nats].
+def log_likelihood(blocks: xr.Dataset, baseline: xr.Dataset, training: Bools, held: Bools) -> float:
+    """Return the log-likelihood of held-out blocks given the training blocks [nats].
 
     It leaves out a constant that depends only on the data.
 
     Parameters
     ----------
-    known, held : ndarray of bool (block,)
+    training, held : ndarray of bool (block,)
         Blocks to predict from, and blocks to predict.
     """
     total = float((_power_terms(blocks, baseline) + _cross_terms(blocks, baseline))[held].sum())
     for axis in map(str, blocks["axis"].values):
-        total += _mean_evidence(blocks, baseline, axis, known | held) - _mean_evidence(
-            blocks, baseline, axis, known
+        total += _mean_evidence(blocks, baseline, axis, training | held) - _mean_evidence(
+            blocks, baseline, axis, training
         )
     return total
 
@@ -365,7 +370,7 @@ def _mean_evidence(blocks: xr.Dataset, baseline: xr.Dataset, axis: str, used: Bo
     return products_mixture(products, weight - np.logaddexp.reduce(weight)).evidence
 
 
-def _allan_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Floats:
+def _allan_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: BlockWindows) -> Floats:
     """Return squared scores of the Allan variance in disjoint windows of held-out stretches."""
     first, stop = [held.first], [held.stop]
     for length in {1, min(SHORT_WINDOW_BLOCKS, int((held.stop - held.first).min()))}:
@@ -376,11 +381,11 @@ def _allan_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: Windows) -> Fl
         start = np.concatenate(inside)
         first.append(start)
         stop.append(start + length)
-    windows = Windows(np.concatenate(first), np.concatenate(stop))
+    windows = BlockWindows(np.concatenate(first), np.concatenate(stop))
     surface = allan_surface(blocks, baseline, windows)
     with np.errstate(divide="ignore", invalid="ignore"):
         z = cube_root_score(surface["observed"] / surface["expected"], surface["shape"])[
-            ..., surface["columns"]["what"] == "avar"
+            ..., surface["columns"]["quantity"] == "avar"
         ]
     return np.asarray(z[np.isfinite(z)] ** 2)
 

@@ -159,10 +159,10 @@ def _candidates_of_effect(
         try:
             effect = kind.example(**values)
             in_windows = with_correlated_powers(predict_exogenous(effect, windows), blocks)
-            case = Prospect(
+            prospect = Prospect(
                 values, with_band_response(in_windows, effect, blocks), blocks, coefficient
             )
-            prospects.append(_drop_hidden_means(kind.name, case, settings))
+            prospects.append(_drop_hidden_means(kind.name, prospect, settings))
         except KeyError as error:
             obstacle = missing_channel_reason((str(error.args[0]),), blocks)
         except OptionError as error:
@@ -212,22 +212,22 @@ def largest_size(effect: str, settings: Settings) -> float:
     }.get(effect, math.inf)
 
 
-def _drop_hidden_means(name: str, case: Prospect, settings: Settings) -> Prospect:
+def _drop_hidden_means(name: str, prospect: Prospect, settings: Settings) -> Prospect:
     """Drop predicted means that white noise hides on every axis even at the largest size.
 
     An axis at rest cannot leak into others: its noise, taken for motion, would only blur real
     motion.
     """
     largest = largest_size(name, settings)
-    if math.isinf(largest) or not case.prediction.mean:
-        return case
-    good = np.isfinite(case.blocks["mean"].values)
-    block_s = float(case.blocks.attrs["block_s"])
-    white = case.coefficient.sel(term="N").values * np.sqrt(HOUR / block_s)
+    if math.isinf(largest) or not prospect.prediction.mean:
+        return prospect
+    good = np.isfinite(prospect.blocks["mean"].values)
+    block_s = float(prospect.blocks.attrs["block_s"])
+    white = prospect.coefficient.sel(term="N").values * np.sqrt(HOUR / block_s)
     mean = {}
-    for column, design in case.prediction.mean.items():
+    for column, design in prospect.prediction.mean.items():
         rows = np.where(good, np.broadcast_to(np.atleast_2d(design), good.shape), np.nan)
         moved = np.sqrt(np.nansum((rows - np.nanmean(rows, axis=1, keepdims=True)) ** 2, axis=1))
         if (largest * moved > settings.clear_sigma * white).any():
             mean[column] = design
-    return case._replace(prediction=replace(case.prediction, mean=mean))
+    return prospect._replace(prediction=replace(prospect.prediction, mean=mean))

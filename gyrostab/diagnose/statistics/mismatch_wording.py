@@ -27,10 +27,10 @@ def length_text(seconds: float) -> str:
     return f"{seconds:.3g} s" if seconds >= 0.1 else f"{seconds * 1e3:.3g} ms"
 
 
-def subject(region: Mapping[str, Any]) -> str:
-    """Write the axes of a mismatch as the beginning of a sentence."""
-    axes = axes_text(region["axes"])
-    return axes[0].upper() + axes[1:]
+def capitalise_axes(axes: Sequence[str]) -> str:
+    """Write axes as the beginning of a sentence."""
+    text = axes_text(axes)
+    return text[0].upper() + text[1:]
 
 
 def is_higher(region: Mapping[str, Any]) -> bool:

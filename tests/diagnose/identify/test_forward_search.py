@@ -24,7 +24,7 @@ from gyrostab.diagnose.identify.identifiability import (
     keep_physical,
     passes_time_shift_test,
 )
-from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.predict import search
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.condition import condition_on
@@ -56,7 +56,7 @@ def shaken():
 @pytest.mark.slow
 def test_noise_has_no_identification():
     identifications = identify([], axes="xy", seed=2)
-    assert identifications.identified == identifications.unknown == ()
+    assert identifications.identified == identifications.unidentified == ()
     assert 3.0 < identifications.examination.threshold < 15.0
     assert identifications.examination.null_best.size == 40
 
@@ -94,7 +94,7 @@ def test_vibration_noise_is_identified_on_its_axis(shaken):
     assert identification.driver == ("vibration",)
     assert identification.evidence_nats > identification.threshold >= shaken.examination.threshold
     assert "temperature_noise" not in identification.alternatives
-    assert not shaken.unknown
+    assert not shaken.unidentified
 
 
 def test_every_other_effect_is_rejected_for_a_competitor(shaken):
@@ -219,14 +219,14 @@ def test_single_effects_are_identified(table, environment, others):
 @pytest.mark.slow
 def test_effect_without_its_channel_is_not_identified():
     identifications = identify(VIBRATION, axes="xy", drop=("vibration",))
-    assert identifications.unknown
+    assert identifications.unidentified
     assert not identifications.identified
-    assert {unidentified.effect for unidentified in identifications.unknown} <= {
+    assert {unidentified.effect for unidentified in identifications.unidentified} <= {
         "~N(t)",
         "~S(f)",
         "~burst",
     }
-    assert all(unidentified.axes == ("x",) for unidentified in identifications.unknown)
+    assert all(unidentified.axes == ("x",) for unidentified in identifications.unidentified)
 
 
 @pytest.mark.slow
@@ -256,12 +256,12 @@ def test_time_shifted_channels_explain_less(shaken):
 
 def test_identified_effect_is_in_the_model_of_the_next(shaken):
     (identification,) = shaken.identified
-    loud = shaken.state.weight[0] / shaken.state.baseline["spectrum"].values[0]
+    loud = shaken.state.expected_power[0] / shaken.state.baseline["spectrum"].values[0]
     vibration = shaken.state.blocks["channel_vibration"].values
     assert loud[vibration > 4].mean() > 1.2
     assert loud[vibration < 1].mean() == pytest.approx(1.0, abs=0.05)
     conditioned = condition_on(shaken.state, list(identification.components))
-    np.testing.assert_allclose(conditioned.weight, shaken.state.weight, rtol=1e-3)
+    np.testing.assert_allclose(conditioned.expected_power, shaken.state.expected_power, rtol=1e-3)
 
 
 def test_identifications_are_frozen_data(shaken):
@@ -339,7 +339,7 @@ def test_every_line_of_a_comb_is_identified():
     } == {("spectral_line", ("x",))}
     assert (
         sorted(
-            component.place
+            component.line_index
             for identification in identifications.identified
             for component in identification.components
         )

@@ -10,17 +10,17 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Floats, Ints
-from gyrostab.diagnose.reduce.block_statistics import pair_indices
-from gyrostab.diagnose.statistics.base import Statistic
+from gyrostab.diagnose.reduce.schema import pair_indices
+from gyrostab.diagnose.statistics.base import Region, Statistic
+from gyrostab.diagnose.statistics.mismatch_wording import axes_text, length_text, taus_text
 from gyrostab.diagnose.statistics.power import LEVEL_COLUMNS
 from gyrostab.diagnose.statistics.scores import (
-    Windows,
+    BlockWindows,
     cube_root_score,
     statistic_dataset,
     sum_over_windows,
     window_set,
 )
-from gyrostab.diagnose.statistics.wording import axes_text, length_text, taus_text
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (20, 80)
@@ -33,10 +33,10 @@ _MIN_FREQUENCY_LINES = 3.5  # lower bands show a mean that moves within blocks r
 _MAX_AVERAGE_SIGMA = 4.0
 
 
-class VarianceStability(Statistic):
+class VarianceFluctuation(Statistic):
     """Variance fluctuation: powers that scatter more than their degrees of freedom allow."""
 
-    name = "variance_stability"
+    name = "variance_fluctuation"
     view = "davar"
     is_ratio = True
 
@@ -89,7 +89,9 @@ class VarianceStability(Statistic):
             rows=rows,
             windows=windows,
             columns={
-                "what": np.repeat([f"variance {span * block:g} s" for span in spans], f_low.size),
+                "quantity": np.repeat(
+                    [f"variance {span * block:g} s" for span in spans], f_low.size
+                ),
                 "tau_min_s": np.tile(0.5 / f_high, len(spans)),
                 "tau_max_s": np.tile(0.5 / f_low, len(spans)),
             },
@@ -100,18 +102,18 @@ class VarianceStability(Statistic):
         )
 
     def prepare(
-        self, blocks: xr.Dataset, baseline: xr.Dataset, regions: Sequence[Mapping[str, Any]]
+        self, blocks: xr.Dataset, baseline: xr.Dataset, regions: Sequence[Region]
     ) -> xr.Dataset:
         """Scale the powers where the noise level differs: that is reported already."""
         spans = [
-            (str(region["axes"]).split(), float(region["begin"]), float(region["end"]))
+            (region["axes"].split(), float(region["begin"]), float(region["end"]))
             for region in regions
-            if region["what"] in LEVEL_COLUMNS
+            if region["quantity"] in LEVEL_COLUMNS
         ]
         return scale_to_expected(blocks, baseline, spans)
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
-        pace = length_text(float(str(region["what"]).split()[1]))
+        pace = length_text(float(region["quantity"].split()[1]))
         estimate = region.get("estimate", np.nan)
         size = f" by {100.0 * estimate:.2g} % (rms)" if np.isfinite(estimate) else ""
         return (
@@ -268,7 +270,7 @@ def _median_over_blocks(values: Floats) -> Floats:
 
 @np.errstate(divide="ignore", invalid="ignore")
 def _score_scatter(
-    level: Floats, weight: Floats, windows: Windows, span: int, *, single: int
+    level: Floats, weight: Floats, windows: BlockWindows, span: int, *, single: int
 ) -> tuple[Floats, Floats, Floats]:
     """Return score, ratio and variation by (record), row, window, column, for `span` blocks.
 
@@ -288,7 +290,7 @@ def _score_scatter(
     average = np.where(present, average, 0.0)
     # An incomplete average at the end of the record does not count.
     begin = np.minimum(-(-windows.first // span), count)
-    inside = Windows(begin, np.maximum(windows.stop // span, begin))
+    inside = BlockWindows(begin, np.maximum(windows.stop // span, begin))
     first = sum_over_windows(total * average, inside)
     square = sum_over_windows(total * average**2, inside)
     number = sum_over_windows(present.astype(float), inside)

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.identify.examination import Identifications
-from gyrostab.diagnose.identify.identification import Selection
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.predict.average_sizes import Point, choose_grid, refine_grid
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
@@ -17,16 +17,16 @@ from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.registry import effects
 
 
-def settle_forms(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
+def choose_forms(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
     """Return identifications with the forms that their models will have.
 
     Each component has a single term where that explains as much, and the exponent that its sizes
     are estimated with. All components of an effect have the same choice of each parameter that is a
-    text. Noise that is calibrated with another
-    form than the model has does not belong to that model.
+    text. Noise that is calibrated with another form than the model has does not belong to that
+    model.
     """
 
-    def settle(identification: Selection) -> Selection:
+    def with_form(identification: Selection) -> Selection:
         state = identifications.state_without(identification, baseline)
         components = _share_choices(identification.components, state)
         return replace(
@@ -39,8 +39,10 @@ def settle_forms(identifications: Identifications, baseline: xr.Dataset) -> Iden
 
     return replace(
         identifications,
-        identified=tuple(settle(identification) for identification in identifications.identified),
-        expected=tuple(settle(identification) for identification in identifications.expected),
+        identified=tuple(
+            with_form(identification) for identification in identifications.identified
+        ),
+        expected=tuple(with_form(identification) for identification in identifications.expected),
     )
 
 
@@ -130,27 +132,29 @@ def prefer_plainer(component: Component, state: State) -> Component:
         for name in dict.fromkeys(names)
         if (variant := _single_term_variant(component, state, name)) is not None
     }
-    gains = {name: _explained_nats(component, state, variant) for name, variant in terms.items()}
+    term_nats = {
+        name: _explained_nats(component, state, variant) for name, variant in terms.items()
+    }
     if is_single:  # rounding or chance may have put another term ahead
         own = component.variant.columns[0]
         own_nats = _explained_nats(component, state, component.variant)
         needed_nats = own_nats - settings.ambiguous_nats - settings.form_error_share * own_nats
-        close = [name for name in terms if name == own or gains[name] > needed_nats]
+        close = [name for name in terms if name == own or term_nats[name] > needed_nats]
         if len(close) < 2:
             return component
         name, *other_names = close
     elif not terms:
         return component
     else:
-        best = max(gains.values())
+        best = max(term_nats.values())
         # the first that explains as much as the best
-        name = next(name for name in terms if gains[name] > best - settings.reject_nats)
+        name = next(name for name in terms if term_nats[name] > best - settings.reject_nats)
         mean, covariance = component_mixture(component, state).moments()
         error = np.sqrt(np.diagonal(covariance))
         correlation = float(np.abs(np.tril(covariance / np.outer(error, error), -1)).max())
         total_nats = 0.5 * float(mean @ np.linalg.solve(covariance, mean))
-        needed_nats = settings.reject_nats + settings.form_error_share * gains[name]
-        if correlation < settings.term_correlation and total_nats - gains[name] > needed_nats:
+        needed_nats = settings.reject_nats + settings.form_error_share * term_nats[name]
+        if correlation < settings.term_correlation and total_nats - term_nats[name] > needed_nats:
             return component
         other_names = [other for other in component.variant.columns if other != name]
     return replace(component, variant=terms[name], note=_describe_unseparated(name, other_names))

@@ -13,18 +13,24 @@ from gyrostab.diagnose.identify.components import (
     merge_lines,
     sum_evidence,
 )
-from gyrostab.diagnose.identify.examination import Examination, Identifications
+from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import keep_physical, passes_time_shift_test
-from gyrostab.diagnose.identify.identification import (
+from gyrostab.diagnose.identify.identifications import Identifications
+from gyrostab.diagnose.identify.naming_order import find_pair, order_passing, order_rivals
+from gyrostab.diagnose.identify.selections import (
     Selection,
     add_selection,
     ambiguous_evidence,
     make_selection,
 )
-from gyrostab.diagnose.identify.naming_order import find_pair, order_passing, order_rivals
 from gyrostab.diagnose.identify.settling import prune_selections, settle_selections
 from gyrostab.diagnose.identify.withdrawal import withdraw_effects, without_pulses
-from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component
+from gyrostab.diagnose.predict.candidates import (
+    Candidate,
+    CandidateEvidence,
+    Component,
+    is_nuisance,
+)
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import combine_rows
@@ -47,9 +53,9 @@ def identify_effects(examination: Examination) -> Identifications:
     """
     examination = identify_expected_effects(examination)
     selected, beaten = _select_all(examination)
-    chosen, identified = settle_selections(examination, prune_selections(examination, selected))
+    pruned = prune_selections(examination, selected)
+    unidentified, identified = settle_selections(examination, pruned)
     identified = without_pulses(identified, examination.settings)
-    unidentified = [selection for selection in chosen if not selection.is_named]
     remaining, withdrawn = withdraw_effects(examination, identified, unidentified)
     unidentified += withdrawn
     return Identifications(
@@ -81,21 +87,23 @@ def _select_all(examination: Examination) -> tuple[list[Selection], dict[str, tu
     }
     effects_left, lines_left = MAX_EFFECTS, MAX_LINES
     beaten: dict[str, tuple[str, float]] = {}
-    is_last = False
+    includes_last_resorts = False
     while effects_left > 0:
-        all_evidence = score_candidates(examination, state, barred, with_last=is_last)
+        all_evidence = score_candidates(
+            examination, state, barred, includes_last_resorts=includes_last_resorts
+        )
         selected = _select_next(examination, all_evidence, state, chosen, beaten)
         selections, shifted = selected or ([], {})
         beaten |= shifted
         barred |= shifted.keys()
         if shifted and not selections:
             continue
-        if not is_last and not any(choice.is_named for choice in selections):
-            is_last = True
+        if not includes_last_resorts and not any(choice.is_named for choice in selections):
+            includes_last_resorts = True  # nothing else passes
             continue
         if not selections:
             break
-        is_last = False
+        includes_last_resorts = False
         for selection in selections:
             if are_lines(selection.components):
                 lines_left -= 1
@@ -129,17 +137,23 @@ def _explained_count_keys(examination: Examination, selection: Selection) -> set
 
 
 def score_candidates(
-    examination: Examination, state: State, barred: Collection[str], *, with_last: bool = True
+    examination: Examination,
+    state: State,
+    barred: Collection[str],
+    *,
+    includes_last_resorts: bool = True,
 ) -> list[CandidateEvidence]:
-    """Compute the evidence of all candidates that are not barred.
+    """Compute the evidence of all candidates that are not barred, last resorts as an option.
 
+    These are in statistics that are tried last (`is_tried_last`).
     Powers are weighted with the strongest effect in the powers, because its noise is in every
     statistic.
     """
     sought = [
         candidate
         for candidate in examination.candidates
-        if candidate.key not in barred and (with_last or not candidate.statistic.is_tried_last)
+        if candidate.key not in barred
+        and (includes_last_resorts or not candidate.statistic.is_tried_last)
     ]
     all_evidence = examination.compute_evidence(sought, state)
     weighted = [
@@ -156,7 +170,7 @@ def score_candidates(
             break
         trial = condition_on(state, find_components(strongest, settings=settings))
         weighted_evidence = examination.compute_evidence(
-            weighted, replace(state, weight=trial.weight)
+            weighted, replace(state, expected_power=trial.expected_power)
         )
         all_evidence = [
             evidence
@@ -186,7 +200,7 @@ def _select_next(
         for key, effect_components in components.items()
     }
     for key, effect_components in list(components.items()):
-        if not key.startswith("~") and sum_evidence(effect_components) > required[key]:
+        if not is_nuisance(key) and sum_evidence(effect_components) > required[key]:
             components[key], better_form = keep_physical(
                 effect_components, state, error=required[key] - examination.threshold
             )
@@ -227,7 +241,7 @@ def _select_next(
     if failed:
         return [], failed
     alternative = passing[0]
-    effects = [key for key in passing if not key.startswith("~")]
+    effects = [key for key in passing if not is_nuisance(key)]
     nearest = [components[key][0].candidate.effect for key in effects[:3]]
     return [
         make_selection(components[alternative], required[alternative], alternatives=nearest)
@@ -255,7 +269,7 @@ def identify_expected_effects(examination: Examination) -> Examination:
     it adds evidence.
     """
     identified: list[Selection] = []
-    state, remaining = examination.start, list(examination.known)
+    state, remaining = examination.start, list(examination.model_effects)
     needed = examination.settings.component_nats
     rounds = MAX_ROUNDS_PER_EFFECT * len(remaining)
     while remaining and rounds > 0:

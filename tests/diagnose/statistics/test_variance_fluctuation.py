@@ -14,7 +14,7 @@ from gyrostab.diagnose.nulls.records import _correlate_lines
 from gyrostab.diagnose.nulls.scores import null_scores, standardise
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result.text import mismatch_statement
-from gyrostab.diagnose.statistics import find_statistic, variance_stability
+from gyrostab.diagnose.statistics import find_statistic, variance_fluctuation
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.spectra.periodogram import taper
 from tests.support.reduced_records import baseline, chunks, records
@@ -52,7 +52,7 @@ def test_moments_of_the_scatter_match_simulated_levels(count, seed):
     drawn = rng.gamma(shape, size=(40_000, count)) / shape * rng.uniform(0.1, 10.0)
     mean = (drawn * shape).sum(axis=1, keepdims=True) / shape.sum()
     scatter = (shape * (drawn - mean) ** 2).sum(axis=1) / mean[:, 0] ** 2
-    expected, variance = variance_stability.scatter_moments(
+    expected, variance = variance_fluctuation.scatter_moments(
         np.array(float(count)), shape.sum(), (1.0 / shape).sum()
     )
     assert scatter.mean() == pytest.approx(expected, abs=5.0 * np.sqrt(variance / scatter.size))
@@ -61,7 +61,7 @@ def test_moments_of_the_scatter_match_simulated_levels(count, seed):
 
 
 def test_scores_of_steady_noise_are_normal(base):
-    z = find_statistic("variance_stability").score(_some_records(base, 60, 3), base)["z"].values
+    z = find_statistic("variance_fluctuation").score(_some_records(base, 60, 3), base)["z"].values
     z = z[np.isfinite(z)]
     assert abs(z.mean()) < 0.05
     assert z.std() == pytest.approx(1.0, abs=0.06)
@@ -71,7 +71,7 @@ def test_scores_of_steady_noise_are_normal(base):
 def test_records_have_the_same_scores_together_as_alone(base):
     drawn = _some_records(base, 3, 4)
     drawn["power"][:, 1, 40:47] = np.nan
-    statistic = find_statistic("variance_stability")
+    statistic = find_statistic("variance_fluctuation")
     alone = [statistic.score(drawn.isel(record=[number]), base) for number in range(3)]
     xr.testing.assert_allclose(statistic.score(drawn, base), xr.concat(alone, "record"), rtol=1e-12)
 
@@ -81,7 +81,7 @@ def test_detection_limit_of_variance_fluctuation(base, null):
     swell = np.sqrt(2.0) * np.sin(
         2.0 * np.pi * np.arange(BLOCKS) / 3.7
     )  # too fast for averages of more than one block
-    critical = null.critical("variance_stability", 0.01)
+    critical = null.critical("variance_fluctuation", 0.01)
     limit = np.sqrt(critical * np.sqrt(2.0 * (BLOCKS - 1)) / (BLOCKS * shape))
     shares = []
     for factor in (0.75, 1.3):
@@ -89,7 +89,7 @@ def test_detection_limit_of_variance_fluctuation(base, null):
         blocks["power"][:, 0] *= np.exp(factor * limit * swell)[:, None]
         shares.append(
             (
-                _largest_score(find_statistic("variance_stability"), blocks, base, null, row=0)
+                _largest_score(find_statistic("variance_fluctuation"), blocks, base, null, row=0)
                 > critical
             ).mean()
         )
@@ -100,10 +100,12 @@ def test_common_variance_fluctuation_is_detected_jointly(base, null):
     blocks = _some_records(base, 30, 5)
     blocks["power"] *= np.exp(0.09 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 12.0))[:, None]
     together, single = (
-        np.median(_largest_score(find_statistic("variance_stability"), blocks, base, null, row=row))
+        np.median(
+            _largest_score(find_statistic("variance_fluctuation"), blocks, base, null, row=row)
+        )
         for row in (3, slice(0, 3))
     )
-    assert together > null.critical("variance_stability", 0.01) > single
+    assert together > null.critical("variance_fluctuation", 0.01) > single
 
 
 @given(st.floats(0.01, 100.0))
@@ -114,7 +116,7 @@ def test_scores_do_not_depend_on_the_noise_level(factor):
     louder = blocks.copy(deep=True)
     louder["power"][:, 1] *= factor
     scores = [
-        find_statistic("variance_stability").score(record, base)["z"].isel(row=[0, 1, 2]).values
+        find_statistic("variance_fluctuation").score(record, base)["z"].isel(row=[0, 1, 2]).values
         for record in (blocks, louder)
     ]
     np.testing.assert_allclose(*scores, atol=1e-6)
@@ -124,8 +126,8 @@ def test_a_single_noisy_block_is_not_variance_fluctuation(base, null):
     blocks = _some_records(base, 20, 6)
     blocks["power"][:, 0, 50] *= 30.0
     assert (
-        _largest_score(find_statistic("variance_stability"), blocks, base, null)
-        > null.critical("variance_stability", 0.01)
+        _largest_score(find_statistic("variance_fluctuation"), blocks, base, null)
+        > null.critical("variance_fluctuation", 0.01)
     ).mean() <= 0.1
 
 
@@ -134,13 +136,14 @@ def test_shared_noise_is_not_variance_fluctuation(base, null):
     blocks["power"][:, 1] = blocks["power"][:, 0]
     blocks["power"][:, 2] = blocks["power"][:, 0]
     blocks["cross"][:] = blocks["power"][:, 0].values[:, None]
-    critical = null.critical("variance_stability", 0.01)
+    critical = null.critical("variance_fluctuation", 0.01)
     assert (
-        _largest_score(find_statistic("variance_stability"), blocks, base, null, row=3) > critical
+        _largest_score(find_statistic("variance_fluctuation"), blocks, base, null, row=3) > critical
     ).mean() <= 0.1
     unknown = blocks.assign(cross=blocks["cross"] * 0.0)
     assert (
-        _largest_score(find_statistic("variance_stability"), unknown, base, null, row=3) > critical
+        _largest_score(find_statistic("variance_fluctuation"), unknown, base, null, row=3)
+        > critical
     ).mean() > 0.9
 
 
@@ -148,11 +151,11 @@ def test_a_burst_with_a_region_is_not_reported_again(base, null):
     blocks = _some_records(base, 1, 9).isel(record=0)
     blocks["power"][0, 60:75] *= 1.7
     regions = locate_mismatches(blocks, base, null)
-    what = [region["what"] for region in regions]
+    what = [region["quantity"] for region in regions]
     assert what == ["level"] or set(what) == {"avar"}
     blocks["power"][1] *= np.exp(0.5 * np.sin(2.0 * np.pi * np.arange(BLOCKS) / 9.0))[:, None]
     regions = locate_mismatches(blocks, base, null)
-    new = [region for region in regions if region["what"].startswith("variance")]
+    new = [region for region in regions if region["quantity"].startswith("variance")]
     assert "y" in {axis for region in new for axis in region["axes"].split()}
     begin, end = min(region["begin"] for region in new), max(region["end"] for region in new)
     assert end - begin > 0.9 * BLOCKS * 20.0
@@ -161,12 +164,12 @@ def test_a_burst_with_a_region_is_not_reported_again(base, null):
 def test_scaled_powers_have_the_expected_mean(base):
     blocks = _some_records(base, 1, 10).isel(record=0)
     blocks["power"][0, 10:40] *= 5.0
-    flat = variance_stability.scale_to_expected(blocks, base, [(["x"], 200.0, 800.0)])
+    flat = variance_fluctuation.scale_to_expected(blocks, base, [(["x"], 200.0, 800.0)])
     ratio = flat["power"].values / base["spectrum"].values
     np.testing.assert_allclose(ratio[0, 10:40].mean(axis=0), 1.0)
     np.testing.assert_array_equal(flat["power"].values[1:], blocks["power"].values[1:])
     np.testing.assert_array_equal(flat["power"].values[0, 40:], blocks["power"].values[0, 40:])
-    assert variance_stability.scale_to_expected(blocks, base, []) is blocks
+    assert variance_fluctuation.scale_to_expected(blocks, base, []) is blocks
 
 
 def _moving_line(blocks, row, first, last, energy, bend=0.0):
@@ -197,7 +200,7 @@ def test_a_drifting_line_is_detected_along_its_path(base, null, first, last, ben
         _largest_score(find_statistic("drifting_line"), blocks, base, null) > critical
     ).mean() > 0.5
     scores = find_statistic("drifting_line").score(blocks, base)
-    best = scores["what"].values[
+    best = scores["quantity"].values[
         np.bincount(
             standardise(scores, null.statistics["drifting_line"])[:, 1, 0].argmax(axis=1)
         ).argmax()
@@ -229,16 +232,16 @@ def test_steady_noise_has_no_drifting_line(base, null):
     ).mean() <= 0.03
     assert (
         _largest_score(
-            find_statistic("variance_stability"), _some_records(base, 100, 15), base, null
+            find_statistic("variance_fluctuation"), _some_records(base, 100, 15), base, null
         )
-        > null.critical("variance_stability", 0.01)
+        > null.critical("variance_fluctuation", 0.01)
     ).mean() <= 0.03
 
 
 def test_short_records_have_no_score(base):
     few = {"rate": 10.0, "block_count": 5}
     assert (
-        find_statistic("variance_stability").score(
+        find_statistic("variance_fluctuation").score(
             records(baseline(**few), 2, np.random.default_rng(1), **few), baseline(**few)
         )
         is None
@@ -251,12 +254,12 @@ def test_short_records_have_no_score(base):
 @pytest.mark.parametrize("block_count", [213, 218, 255])
 def test_windows_after_the_last_average_have_no_score(block_count):
     small = {"rate": 10.0, "block_count": block_count}
-    scores = find_statistic("variance_stability").score(
+    scores = find_statistic("variance_fluctuation").score(
         records(baseline(**small), 1, np.random.default_rng(4), **small), baseline(**small)
     )
     behind = (scores["first"] > block_count // 32 * 32).values
     assert behind.any()
-    long = np.char.startswith(scores["what"].values.astype(str), "variance 640 s")
+    long = np.char.startswith(scores["quantity"].values.astype(str), "variance 640 s")
     assert long.any()
     assert np.isnan(scores["z"].values[..., behind, :][..., long]).all()
     whole = (scores["stop"] - scores["first"] == block_count).values
@@ -275,7 +278,7 @@ def test_a_part_without_samples_is_skipped(base, null):
 def test_one_axis_has_no_joint_row():
     single_axis = baseline(axes="x", **SMALL)
     blocks = records(single_axis, 2, np.random.default_rng(1), **SMALL)
-    assert find_statistic("variance_stability").score(blocks, single_axis)[
+    assert find_statistic("variance_fluctuation").score(blocks, single_axis)[
         "axes"
     ].values.tolist() == ["x"]
     assert find_statistic("drifting_line").score(blocks, single_axis)["axes"].values.tolist() == [
@@ -285,23 +288,23 @@ def test_one_axis_has_no_joint_row():
 
 def test_a_level_and_its_scatter_are_two_mismatches():
     region = {
-        "statistic": "variance_stability",
+        "statistic": "variance_fluctuation",
         "view": "davar",
         "axes": "x",
-        "what": "avar",
+        "quantity": "avar",
         "begin": 0.0,
         "end": 100.0,
         "tau_min_s": 0.01,
         "tau_max_s": 0.1,
     }
     region |= {"frequency": np.nan, "sign": 1, "z": 9.0, "p_value": 1e-6}
-    assert len(merge_regions([region, region | {"what": "variance 20 s"}])) == 2
+    assert len(merge_regions([region, region | {"quantity": "variance 20 s"}])) == 2
     assert (
         len(
             merge_regions(
                 [
-                    region | {"what": "variance 40 s"},
-                    region | {"what": "variance 20 s", "axes": "x y"},
+                    region | {"quantity": "variance 40 s"},
+                    region | {"quantity": "variance 20 s", "axes": "x y"},
                 ]
             )
         )
@@ -311,9 +314,9 @@ def test_a_level_and_its_scatter_are_two_mismatches():
 
 def test_statements_give_time_scale_and_frequencies():
     region = {
-        "statistic": "variance_stability",
+        "statistic": "variance_fluctuation",
         "view": "davar",
-        "what": "variance 40 s",
+        "quantity": "variance 40 s",
         "axes": ["x", "y"],
         "begin": 0.0,
         "end": 2000.0,
@@ -325,7 +328,7 @@ def test_statements_give_time_scale_and_frequencies():
     assert "axes x and y fluctuates over the whole record" in statement
     assert "one stretch of 40 s to another" in statement
     assert "8 % (rms)" in statement
-    glide = region | {"statistic": "drifting_line", "what": "drifting 1.58 3.42", "axes": ["y"]}
+    glide = region | {"statistic": "drifting_line", "quantity": "drifting 1.58 3.42", "axes": ["y"]}
     assert (
         "a drifting line over the whole record, from about 1.58 Hz to about 3.42 Hz"
         in mismatch_statement(glide, 2000.0)
@@ -360,7 +363,8 @@ def test_an_interval_that_ends_within_a_block_leaves_no_fluctuation():
         make_log(noise, rate=10.0, unit="deg/h", axis=["x", "y"]), block="1000samples"
     )
     base = calibrate_noise(blocks, quiet=(0.0, float(blocks["end"][19])))
-    scaled = variance_stability.scale_to_expected(blocks, base, [(("x", "y"), 2_000.0, 4_100.0)])
+    scaled = variance_fluctuation.scale_to_expected(blocks, base, [(("x", "y"), 2_000.0, 4_100.0)])
     assert (
-        float(np.nanmax(find_statistic("variance_stability").score(scaled, base)["z"].values)) < 4.8
+        float(np.nanmax(find_statistic("variance_fluctuation").score(scaled, base)["z"].values))
+        < 4.8
     )

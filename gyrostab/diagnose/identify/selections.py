@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from gyrostab.diagnose.identify.components import are_lines, axes_of, sum_evidence
-from gyrostab.diagnose.predict.candidates import Component
-from gyrostab.diagnose.predict.condition import condition_on_components, refit_weights
+from gyrostab.diagnose.predict.candidates import Component, is_nuisance
+from gyrostab.diagnose.predict.condition import condition_on_components, refit_powers
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
@@ -19,12 +19,11 @@ _FILTER = "logger_filter"
 class Selection:
     """What forward selection puts into the model: an effect, or a nuisance alternative.
 
-    It is equal only to itself.
+    It is equal only to itself. A variable `identification` holds a selection that `is_named`, one
+    called `selection` may hold either.
     """
 
-    #: Name in the registry, or one of
-    #: `gyrostab.diagnose.identify.examination.NUISANCE_ALTERNATIVES`.
-    effect: str
+    effect: str  # name in the registry, or one of `NUISANCE_ALTERNATIVES`
     driver: tuple[str, ...]  # channels of the log that it follows, in the order of the effect's
     axes: tuple[str, ...]
     components: tuple[Component, ...]  # statistics and rows in which it shows
@@ -39,7 +38,7 @@ class Selection:
     @property
     def is_named(self) -> bool:
         """Whether it is an effect."""
-        return not self.effect.startswith("~")
+        return not is_nuisance(self.effect)
 
 
 def components_of(chosen: Iterable[Selection]) -> list[Component]:
@@ -63,11 +62,11 @@ def conditioned_states(start: State, chosen: Sequence[Selection]) -> Iterator[St
     What consecutive lines add to the powers is fitted once for all of them, after the last.
     """
     state = start
-    of_lines = [are_lines(selection.components) for selection in chosen]
+    is_line_only = [are_lines(selection.components) for selection in chosen]
     for number, selection in enumerate(chosen):
         state = condition_on_components(state, selection.components)
-        if not all(of_lines[number : number + 2]) or number + 1 == len(chosen):
-            state = refit_weights(state)
+        if not all(is_line_only[number : number + 2]) or number + 1 == len(chosen):
+            state = refit_powers(state)
         yield state
 
 
@@ -134,7 +133,7 @@ def reduce_selection(
 
 def _is_same_effect(first: Selection, other: Selection) -> bool:
     lines = {
-        component.place
+        component.line_index
         for component in components_of((first, other))
         if component.statistic.is_line
     }
@@ -202,7 +201,7 @@ def form_error(
                 and own.statistic.error_shows_in[0] in component.statistic.error_shows_in
                 and {*own.row} & {*component.row}
             ]
-            of_spectrum = (
+            is_spectral = (
                 component.statistic.is_power
                 and bool(selection.driver)
                 and any(
@@ -210,6 +209,6 @@ def form_error(
                     for candidate in affected_candidates
                 )
             )
-            share = settings.spectrum_error_share if of_spectrum else settings.form_error_share
+            share = settings.spectrum_error_share if is_spectral else settings.form_error_share
             error += share * component.evidence_nats if affected_candidates else 0.0
     return error

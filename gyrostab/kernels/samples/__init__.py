@@ -1,0 +1,1 @@
+"""Statistics of samples: moments, counts and outliers."""
