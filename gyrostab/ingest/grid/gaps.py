@@ -11,7 +11,15 @@ from gyrostab.ingest.gap_table import MISSING, OUTSIDE_RANGE, UNREADABLE, sort_l
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, find_spans
 from gyrostab.ingest.uniform.core import add_spans, as_uniform, grid_of, merge_spans, with_table
-from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER, RESTART, STEP
+from gyrostab.kernels.grid.stamps import (
+    DUPLICATE,
+    EVENT_CAUSE,
+    EVENT_ROW,
+    EVENT_SAMPLE,
+    OUT_OF_ORDER,
+    RESTART,
+    STEP,
+)
 from gyrostab.schema import GAP_CAUSES, signal_name
 
 
@@ -20,11 +28,11 @@ def _missing_samples(placement: Placement, scanned: ScanPass) -> Ints:
     runs, events = placement.runs, placement.events
     end, start = runs[:-1, 0] + runs[:-1, 2], runs[1:, 0]
     # a late row that was put in its place has no neighbours among the rows
-    is_late = np.isin(runs[:, 1], events[events[:, 0] == OUT_OF_ORDER, 2])
+    is_late = np.isin(runs[:, 1], events[events[:, EVENT_CAUSE] == OUT_OF_ORDER, EVENT_ROW])
     row_end = np.maximum.accumulate(np.where(is_late, 0, runs[:, 1] + runs[:, 2]))[:-1]
     row_start = np.where(is_late[1:], row_end, runs[1:, 1])
     listed_rows = np.sort(
-        events[np.isin(events[:, 0], (DUPLICATE, OUT_OF_ORDER)), 2]
+        events[np.isin(events[:, EVENT_CAUSE], (DUPLICATE, OUT_OF_ORDER)), EVENT_ROW]
     )  # rows that have a line of another cause
     skipped = (
         row_start
@@ -32,15 +40,15 @@ def _missing_samples(placement: Placement, scanned: ScanPass) -> Ints:
         - (np.searchsorted(listed_rows, row_start) - np.searchsorted(listed_rows, row_end))
     )
     skipped = np.where(row_start > row_end, np.maximum(skipped, 0), 0)
-    broken = events[np.isin(events[:, 0], (STEP, RESTART))]
-    at = np.searchsorted(broken[:, 1], end)
+    broken = events[np.isin(events[:, EVENT_CAUSE], (STEP, RESTART))]
+    at = np.searchsorted(broken[:, EVENT_SAMPLE], end)
     at_break = np.zeros(len(end), dtype=bool)
     cause = np.where(skipped > 0, UNREADABLE, MISSING)
     if len(broken):
         at = np.minimum(at, len(broken) - 1)
-        at_break = broken[at, 1] == end
-        cause = np.where(at_break, broken[at, 0], cause)
-    listed = (start > end) | ((skipped > 0) & (scanned.absent <= 0.01 * scanned.rows))
+        at_break = broken[at, EVENT_SAMPLE] == end
+        cause = np.where(at_break, broken[at, EVENT_CAUSE], cause)
+    listed = (start > end) | ((skipped > 0) & (scanned.absent_count <= 0.01 * scanned.row_count))
     return np.stack([end, start, start - end, skipped, cause], axis=1)[listed]
 
 
@@ -60,25 +68,26 @@ def _unusable_cells(spans: Ints, cause: int, placement: Placement) -> Ints:
 
 def _dropped_rows(events: Ints) -> Ints:
     """List the dropped or moved rows; consecutive rows of one cause are one line."""
-    rows = events[np.isin(events[:, 0], (DUPLICATE, OUT_OF_ORDER))]
-    rows = rows[np.argsort(rows[:, 2], kind="stable")]
+    rows = events[np.isin(events[:, EVENT_CAUSE], (DUPLICATE, OUT_OF_ORDER))]
+    rows = rows[np.argsort(rows[:, EVENT_ROW], kind="stable")]
     if len(rows) == 0:
         return np.empty((0, 5), dtype=np.int64)
-    new = np.concatenate([[True], (np.diff(rows[:, 2]) > 1) | (np.diff(rows[:, 0]) != 0)])
+    row_steps, cause_steps = np.diff(rows[:, [EVENT_ROW, EVENT_CAUSE]], axis=0).T
+    new = np.concatenate([[True], (row_steps > 1) | (cause_steps != 0)])
     at = np.flatnonzero(new)
     count = np.diff(np.append(at, len(rows)))
-    sample = np.minimum.reduceat(rows[:, 1], at)
-    return np.stack([sample, sample, np.zeros_like(count), count, rows[at, 0]], axis=1)
+    sample, cause = np.minimum.reduceat(rows[:, EVENT_SAMPLE], at), rows[at, EVENT_CAUSE]
+    return np.stack([sample, sample, np.zeros_like(count), count, cause], axis=1)
 
 
 def find_gaps(placement: Placement, scanned: ScanPass) -> Ints:
     """Make the table of all gaps in samples, with the columns of `ingest.gap_table.COLUMNS`."""
     unreadable = [scanned.unreadable]
-    if placement.placed > scanned.rows - scanned.absent - scanned.repeated:
+    if placement.placed_count > scanned.row_count - scanned.absent_count - scanned.repeated_count:
         # rows without any number have samples too, because they count
         absent = [
-            find_spans(~scanned.mask(begin, min(begin + BLOCK_ROWS, scanned.rows)), begin)
-            for begin in range(0, scanned.rows, BLOCK_ROWS)
+            find_spans(~scanned.mask(begin, min(begin + BLOCK_ROWS, scanned.row_count)), begin)
+            for begin in range(0, scanned.row_count, BLOCK_ROWS)
         ]
         unreadable.append(merge_spans(absent))
     table = np.concatenate(

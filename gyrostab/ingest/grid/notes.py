@@ -19,7 +19,7 @@ from gyrostab.ingest.grid.jitter import MIN_SIGMA
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.rate import DeviatingStretch, RateEstimate
 from gyrostab.ingest.grid.scan_pass import ScanPass, file_of, record_name
-from gyrostab.kernels.grid.stamps import DUPLICATE, OUT_OF_ORDER
+from gyrostab.kernels.grid.stamps import DUPLICATE, EVENT_CAUSE, EVENT_ROW, OUT_OF_ORDER
 from gyrostab.schema import log_channels
 from gyrostab.time.grid import grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
@@ -116,14 +116,23 @@ def describe_rate(
     raw: xr.Dataset, estimate: RateEstimate, deviating: list[DeviatingStretch], placement: Placement
 ) -> list[str]:
     """Return notes on the sampling rate."""
-    where, rate = record_name(raw), placement.rate
-    notes = []
+    where = record_name(raw)
+    return [
+        *_describe_method(where, estimate, placement),
+        *_describe_other_rates(where, estimate, placement),
+        *_describe_deviating(raw, deviating, placement.rate),
+    ]
+
+
+def _describe_method(where: str, estimate: RateEstimate, placement: Placement) -> list[str]:
+    """Say how rows are placed whose single stamps do not give the sample."""
+    notes, rate = [], placement.rate
     reason = (
         "many rows share one stamp"
-        if estimate.coarse
+        if estimate.stamps_are_shared
         else "the stamps come in bursts, as rows arrive and not as they are sampled"
     )
-    if estimate.counted:
+    if estimate.places_by_count:
         reach = (
             f"; stamps and samples differ by up to {format_duration(placement.wander / rate)} in "
             "the long run"
@@ -147,36 +156,50 @@ def describe_rate(
             f"as times of arrival do: rows keep their order at {rate:.10g} Hz, and a missing "
             f"sample is located to a few rows{_IF_HIGHER * (jitter.sigma > _UNCERTAIN_SIGMA)}"
         )
-    if estimate.even is not None:
+    return notes
+
+
+def _describe_other_rates(where: str, estimate: RateEstimate, placement: Placement) -> list[str]:
+    """Say which other rates fit the stamps, and how far the rate is from the estimated one."""
+    notes, rate = [], placement.rate
+    lower, higher = estimate.rate_without_losses, estimate.rate_with_losses
+    if lower is not None:
         notes.append(
             f"{where}: the steps between stamps recur, or the rows come in packets: the stamps fit "
             f"{rate:.10g} Hz with a share of "
-            f"{1 - estimate.even / rate:.2g} missing, and {estimate.even:g} Hz with none; "
+            f"{1 - lower / rate:.2g} missing, and {lower:g} Hz with none; "
             f"{rate:.10g} Hz is used: "
-            f"if no rows are missing, give --rate {estimate.even:g}"
+            f"if no rows are missing, give --rate {lower:g}"
         )
-    if estimate.finer is not None:
+    if higher is not None:
         notes.append(
-            f"{where}: the stamps lie near multiples of the period of {estimate.finer:g} Hz, as if "
+            f"{where}: the stamps lie near multiples of the period of {higher:g} Hz, as if "
             "rows of a log at that rate were missing; they are read as even samples at "
-            f"{rate:.10g} Hz: if rows are missing, give --rate {estimate.finer:g}"
+            f"{rate:.10g} Hz: if rows are missing, give --rate {higher:g}"
         )
-    off = abs(estimate.raw / rate - 1)
+    off = abs(estimate.unrounded / rate - 1)
     if off * placement.size > 1 and off > 2 * estimate.error / rate:
         notes.append(
-            f"{where}: the stamps say {estimate.raw:.10g} Hz, {1e6 * off:.1f} parts per million "
-            f"from {rate:.10g} Hz"
+            f"{where}: the stamps say {estimate.unrounded:.10g} Hz, {1e6 * off:.1f} parts per "
+            f"million from {rate:.10g} Hz"
         )
+    return notes
+
+
+def _describe_deviating(
+    raw: xr.Dataset, deviating: list[DeviatingStretch], rate: float
+) -> list[str]:
+    """Name the stretches with another rate, or its range if there are many of nearly this rate."""
     if len(deviating) > 2 and all(
         abs(stretch.rate / rate - 1) < _MAX_WANDER for stretch in deviating
     ):
         rates = [stretch.rate for stretch in deviating]
-        notes.append(
-            f"{where}: the sampling rate is not {rate:.6g} Hz throughout, but wanders from "
-            f"{min(rates):.6g} to {max(rates):.6g} Hz, as without a stable clock; by their stamps "
-            "samples are missing or dropped"
-        )
-        deviating = []
+        return [
+            f"{record_name(raw)}: the sampling rate is not {rate:.6g} Hz throughout, but wanders "
+            f"from {min(rates):.6g} to {max(rates):.6g} Hz, as without a stable clock; by their "
+            "stamps samples are missing or dropped"
+        ]
+    notes = []
     for stretch in deviating[:_MAX_NAMED]:
         (file, first), (_, last) = (file_of(raw, row) for row, _ in (stretch.first, stretch.last))
         begin, end = (format_stamp(stamp) for _, stamp in (stretch.first, stretch.last))
@@ -190,7 +213,7 @@ def describe_rate(
 
 def _describe_breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
     notes = []
-    events = placement.events[placement.events[:, 0] >= min(CLOCK_STEP, RESTART)]
+    events = placement.events[placement.events[:, EVENT_CAUSE] >= min(CLOCK_STEP, RESTART)]
     for cause, _sample, row, before, after in events[:_MAX_NAMED].tolist():
         file, local = file_of(raw, row)
         text = describe_break(f" at row {local}", cause, before, after, "rows")
@@ -250,24 +273,25 @@ def describe_placement(
     where = record_name(raw)
     notes = [*_describe_breaks(raw, placement), *_describe_missing(raw, placement, table)]
     events = placement.events
-    twice = events[events[:, 0] == DUPLICATE]
+    twice = events[events[:, EVENT_CAUSE] == DUPLICATE]
     if len(twice):
+        first = _name_row(raw, int(twice[:, EVENT_ROW].min()))
         notes.append(
             f"{where}: dropped, because another row holds their sample: "
-            f"{_count_of(len(twice), 'row')}, first {_name_row(raw, int(twice[:, 2].min()))}"
+            f"{_count_of(len(twice), 'row')}, first {first}"
             + _IF_HIGHER
-            * (len(twice) > _MANY_SHARE * scanned.rows)
+            * (len(twice) > _MANY_SHARE * scanned.row_count)
         )
-    late = events[events[:, 0] == OUT_OF_ORDER]
-    n_placed = int((placement.samples_of(late[:, 2]) >= 0).sum())
+    late = events[events[:, EVENT_CAUSE] == OUT_OF_ORDER]
+    n_placed = int((placement.samples_of(late[:, EVENT_ROW]) >= 0).sum())
     if len(late):
         notes.append(
             f"{where}: out of order: {_count_of(len(late), 'row')}, first "
-            f"{_name_row(raw, int(late[:, 2].min()))}; "
+            f"{_name_row(raw, int(late[:, EVENT_ROW].min()))}; "
             f"{n_placed} were put in their place, {len(late) - n_placed} dropped"
         )
     dropped = len(twice) + len(late) - n_placed
-    lost = scanned.rows - scanned.absent - placement.placed - dropped
+    lost = scanned.row_count - scanned.absent_count - placement.placed_count - dropped
     if lost > 0:
         notes.append(
             f"{where}: dropped without a readable time stamp: {_count_of(lost, 'row')} whose "
@@ -289,7 +313,7 @@ def describe_placement(
     ]
     notes += [
         f"{where}: {nothing} channel {channel}, which is left out; check its column"
-        for channel, count in scanned.filled.items()
+        for channel, count in scanned.filled_counts.items()
         if count == 0
     ]
     return notes

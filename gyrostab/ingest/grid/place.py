@@ -21,6 +21,10 @@ from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.kernels.grid import stamps as kernel
 from gyrostab.kernels.grid.stamps import (
     DUPLICATE,
+    EVENT_CAUSE,
+    EVENT_COLUMNS,
+    EVENT_ROW,
+    EVENT_SAMPLE,
     LOOK_AHEAD,
     NO_STAMP,
     OUT_OF_ORDER,
@@ -54,8 +58,7 @@ class Placement:
     rate: float  # sampling rate [Hz]
     #: (n, 3): first sample, first row, length; sorted by sample, without overlap.
     runs: Ints
-    #: (n, 5): cause (number in schema.GAP_CAUSES), sample, row, stamp before [ns], stamp [ns];
-    #: sorted by sample.
+    #: (n, 5): `EVENT_CAUSE` to `EVENT_STAMP` of `gyrostab.kernels.grid.stamps`; sorted by sample.
     events: Ints
     #: Largest distance of the smoothed stamps from the grid [samples]; only for counted rows.
     wander: float = 0.0
@@ -68,7 +71,7 @@ class Placement:
         return int(self.runs[-1, 0] + self.runs[-1, 2]) if len(self.runs) else 0
 
     @property
-    def placed(self) -> int:
+    def placed_count(self) -> int:
         """Number of rows that have a sample."""
         return int(self.runs[:, 2].sum())
 
@@ -82,7 +85,8 @@ class Placement:
     @property
     def has_late_rows(self) -> bool:
         """Whether three consecutive rows were dropped, as happens after a pause."""
-        rows = np.sort(self.events[np.isin(self.events[:, 0], (DUPLICATE, OUT_OF_ORDER)), 2])
+        is_dropped = np.isin(self.events[:, EVENT_CAUSE], (DUPLICATE, OUT_OF_ORDER))
+        rows = np.sort(self.events[is_dropped, EVENT_ROW])
         rows = rows[self.samples_of(rows) < 0]
         return bool((rows[2:] - rows[:-2] == 2).any())
 
@@ -92,9 +96,9 @@ def make_placement(
 ) -> Placement:
     """Make a placement of lists of runs and events, sorted by sample."""
     table = np.concatenate(runs)
-    happened = np.concatenate([*events, np.empty((0, 5), dtype=np.int64)])
+    happened = np.concatenate([*events, np.empty((0, EVENT_COLUMNS), dtype=np.int64)])
     table = table[np.argsort(table[:, 0], kind="stable")]
-    happened = happened[np.argsort(happened[:, 1], kind="stable")]
+    happened = happened[np.argsort(happened[:, EVENT_SAMPLE], kind="stable")]
     return Placement(start, rate, table, happened, wander)
 
 
@@ -102,7 +106,7 @@ def check_grid(
     raw: xr.Dataset, placement: Placement, max_gap: float, limits: Mapping[str, float]
 ) -> None:
     """Refuse a grid with far more samples than rows, before it is allocated."""
-    if not is_absurd_grid(placement.size, placement.placed, limits):
+    if not is_absurd_grid(placement.size, placement.placed_count, limits):
         return
     runs = placement.runs
     holes = runs[1:, 0] - runs[:-1, 0] - runs[:-1, 2]
@@ -127,7 +131,7 @@ def check_grid(
         f"{file_of(raw, rows[0])[0]}: from {places[0]} to {places[1]} there are "
         f"{format_duration(gap)} without samples, and the grid of "
         f"{placement.rate:.10g} Hz would have {placement.size:.4g} samples for "
-        f"{placement.placed:,} rows; {fix}. If the stamps are right: "
+        f"{placement.placed_count:,} rows; {fix}. If the stamps are right: "
         f"{describe_limit('grid_samples', placement.size, limits)}"
     )
 
@@ -258,7 +262,7 @@ def place_by_count(
     width = max(64, int(4 * rate))
     windows, first = _make_windows(stamps, period, width)
     jumps, wander = _find_jumps(windows)
-    edge = windows.high[0] if estimate.coarse else windows.low[0]
+    edge = windows.high[0] if estimate.stamps_are_shared else windows.low[0]
     start = first + int(np.rint(edge * period)) if abs(edge) < 2 * width else first
     shifts, cuts, events = [0], [0], []
     begun = 0.0
@@ -274,7 +278,7 @@ def place_by_count(
         shifts.append(shifts[-1] + extra)
         cuts.append(row)
     runs, cut_rows = _counted_runs(stamps, np.array(cuts), np.array(shifts))
-    numbers = np.array(events, dtype=np.int64).reshape(-1, 5)
+    numbers = np.array(events, dtype=np.int64).reshape(-1, EVENT_COLUMNS)
     numbers[:, 2] = cut_rows[numbers[:, 2]]
     return make_placement(start, rate, runs, [numbers], wander)
 

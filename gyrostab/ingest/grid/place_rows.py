@@ -29,7 +29,16 @@ from gyrostab.ingest.grid.rate import (
 )
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, stamp_blocks
 from gyrostab.ingest.grid.starting_period import SECOND, Stamps
-from gyrostab.kernels.grid.stamps import DUPLICATE, NO_STAMP, RESTART, STEP
+from gyrostab.kernels.grid.stamps import (
+    DUPLICATE,
+    EVENT_BEFORE,
+    EVENT_CAUSE,
+    EVENT_ROW,
+    EVENT_STAMP,
+    NO_STAMP,
+    RESTART,
+    STEP,
+)
 from gyrostab.schema import signal_name
 from gyrostab.store.lazy import find_source, read_slice
 from gyrostab.time.grid import period_ns
@@ -75,48 +84,58 @@ class RowPlacer:
         scanned = self.scanned
         clock = find_source(self.raw["time"].data) if "time" in self.raw.variables else None
         line = None if clock is None else find_line(clock.parts)
-        if line is None or line[1] <= 0 or scanned.absent or scanned.repeated:
+        if line is None or line[1] <= 0 or scanned.absent_count or scanned.repeated_count:
             return None
         start, step = line
         rate = float(f"{SECOND / step:.13g}")
         if period_ns(rate) != (step, 0.0) or self.declared not in (None, rate):
             return None
-        runs = [np.array([[0, 0, scanned.rows]], dtype=np.int64)]
+        runs = [np.array([[0, 0, scanned.row_count]], dtype=np.int64)]
         return make_placement(start, rate, runs, []), []
 
     def _place_all(self) -> tuple[Placement, list[str]]:
+        """Estimate the rate from the stamps, and place the rows by count, by stamp or in order.
+
+        Rows that repeat others are marked in `scanned`.
+        """
         raw, scanned, declared = self.raw, self.scanned, self.declared
         if "time" not in raw.variables:
             return self._place_without_time()
         # single unreadable rows still occupy samples
-        count_all_rows = scanned.absent <= 0.01 * scanned.rows
+        count_all_rows = scanned.absent_count <= 0.01 * scanned.row_count
         stamps: Stamps = partial(stamp_blocks, raw, scanned)
         doubled = find_doubled(raw)
         scanned.leave_out(doubled[:, 0])
         try:
             estimate = estimate_rate(stamps, where=self.where)
         except TimeError:
-            if declared is None or scanned.rows - scanned.absent > 1:
+            if declared is None or scanned.row_count - scanned.absent_count > 1:
                 raise
-            estimate = RateEstimate(declared, 0.0, counted=False, coarse=False, raw=declared)
+            estimate = RateEstimate(
+                declared, 0.0, places_by_count=False, stamps_are_shared=False, unrounded=declared
+            )
         if declared is None:
             estimate = self._estimate_by_rows(stamps, estimate)
         rate, notes = estimate.rate, list[str]()
         if declared is not None:
-            if abs(declared / estimate.raw - 1) > _MAX_RATE_DIFFERENCE:
+            if abs(declared / estimate.unrounded - 1) > _MAX_RATE_DIFFERENCE:
                 estimate, note = self._estimate_declared(stamps, estimate, declared)
                 notes.append(note)
             # a given rate settles the question
-            rate, estimate = declared, replace(estimate, finer=None, even=None)
+            rate, estimate = (
+                declared,
+                replace(estimate, rate_with_losses=None, rate_without_losses=None),
+            )
         deviating: list[DeviatingStretch] = []
-        if estimate.counted:
-            counted = partial(stamp_blocks, raw, scanned, all_rows=count_all_rows)
-            placement = place_by_count(counted, estimate, rate, max_gap=self.max_gap)
+        if estimate.places_by_count:
+            stamps_to_count = partial(stamp_blocks, raw, scanned, all_rows=count_all_rows)
+            placement = place_by_count(stamps_to_count, estimate, rate, max_gap=self.max_gap)
         else:
             placement = self._place_stamped(stamps, estimate.jitter, rate, count_all_rows)
             if _is_sharp(estimate.jitter):
                 deviating = deviating_stretches(stamps, 1e9 / rate)
-        doubled = doubled[~np.isin(doubled[:, 0], placement.events[:, 2])]  # without longer ones
+        in_longer = np.isin(doubled[:, 0], placement.events[:, EVENT_ROW])
+        doubled = doubled[~in_longer]
         if len(doubled):
             placement = _with_duplicates(placement, [_duplicate_events(placement, *doubled.T)])
         notes += describe_rate(raw, estimate, deviating, placement)
@@ -139,7 +158,7 @@ class RowPlacer:
             f"{self.where}: no time in the file and no --start: the log is said to start at "
             "1970-01-01T00:00:00"
         )
-        runs = [np.array([[0, 0, self.scanned.rows]], dtype=np.int64)]
+        runs = [np.array([[0, 0, self.scanned.row_count]], dtype=np.int64)]
         placement = make_placement(stamp_ns(text) if text else 0, self.declared, runs, [])
         return placement, [] if text else [note]
 
@@ -149,13 +168,13 @@ class RowPlacer:
         If successive rows have numbers, the rate is that of all rows. The stamps of a few hundred
         rows with random losses between them also fit other rates, with jitter.
         """
-        if not self.scanned.absent or self.scanned.rows > _MANY_ROWS:
+        if not self.scanned.absent_count or self.scanned.row_count > _MANY_ROWS:
             return estimate
-        present = np.flatnonzero(self.scanned.mask(0, self.scanned.rows))
+        present = np.flatnonzero(self.scanned.mask(0, self.scanned.row_count))
         all_stamps = read_stamps(self.raw, int(present[0]), int(present[-1]) + 1)
         line = find_line([find_even(all_stamps.view("datetime64[ns]"))])
-        rate = SECOND / line[1] if line is not None and line[1] > 0 else estimate.raw
-        if abs(rate / estimate.raw - 1) <= _MAX_RATE_DIFFERENCE:
+        rate = SECOND / line[1] if line is not None and line[1] > 0 else estimate.unrounded
+        if abs(rate / estimate.unrounded - 1) <= _MAX_RATE_DIFFERENCE:
             return estimate
         by_rows = estimate_near(stamps, rate)
         return by_rows if by_rows is not None and by_rows.jitter is None else estimate
@@ -166,23 +185,24 @@ class RowPlacer:
         """Estimate the rate near a declared one that the stamps alone do not say, with a note."""
         near_estimate = estimate_near(stamps, declared)
         named = (
-            estimate.even is not None and abs(declared / estimate.even - 1) <= _MAX_RATE_DIFFERENCE
+            estimate.rate_without_losses is not None
+            and abs(declared / estimate.rate_without_losses - 1) <= _MAX_RATE_DIFFERENCE
         )  # without the recurring losses
         if (
             near_estimate is None
-            or abs(declared / near_estimate.raw - 1) > _MAX_RATE_DIFFERENCE
+            or abs(declared / near_estimate.unrounded - 1) > _MAX_RATE_DIFFERENCE
             or (not named and is_far_worse(stamps, near_estimate, estimate))
         ):
             raise TimeError(
                 f"{self.where}: the sampling rate given is {declared:.10g} Hz, but the time stamps "
-                f"say {estimate.raw:.6g} Hz, and neither "
+                f"say {estimate.unrounded:.6g} Hz, and neither "
                 "lost samples nor jitter explain the difference; "
                 "leave out --rate to use the stamps, or correct --rate, --epoch or the unit of "
                 "the time column"
             )
         return near_estimate, (
-            f"{self.where}: the stamps alone say {estimate.raw:.6g} Hz; they fit the rate given, "
-            f"{declared:.10g} Hz, which is used"
+            f"{self.where}: the stamps alone say {estimate.unrounded:.6g} Hz; they fit the rate "
+            f"given, {declared:.10g} Hz, which is used"
         )
 
     def _place_stamped(
@@ -194,21 +214,26 @@ class RowPlacer:
 
         def place_along(jitter: JitterModel) -> Placement:
             def place() -> Placement:  # repetitions occupy no samples
-                by_row = count_all_rows and not scanned.repeated
+                by_row = count_all_rows and not scanned.repeated_count
                 return place_in_order(stamps, jitter, rate, by_row=by_row, **options)
 
             return self._place_once(place)
 
         if jitter is not None and not _is_sharp(jitter):
             return place_along(jitter)
-        doubled = scanned.repeated
+        repeated_before = scanned.repeated_count
         placement = self._place_once(partial(place_by_stamp, stamps, rate, **options))
-        dropped = scanned.rows - scanned.absent - scanned.repeated - placement.placed
-        has_repeats = scanned.repeated > doubled
+        dropped = (
+            scanned.row_count
+            - scanned.absent_count
+            - scanned.repeated_count
+            - placement.placed_count
+        )
+        has_repeats = scanned.repeated_count > repeated_before
         if not has_repeats and (dropped >= _MIN_DROPPED_ROWS or placement.has_late_rows):
             # placing in order may recover them
             along = place_along(jitter or JitterModel(1e9 / rate, MIN_SIGMA, "all", 1.0, 0.5))
-            if along.placed - placement.placed >= _LATE_SHARE * dropped:
+            if along.placed_count - placement.placed_count >= _LATE_SHARE * dropped:
                 placement = along
         return placement
 
@@ -239,7 +264,8 @@ def find_repeats(raw: xr.Dataset, placement: Placement) -> Ints:
     Returns (n, 3): first row of the repetition, first row of what it repeats, number of rows.
     """
     events = placement.events
-    back = events[np.isin(events[:, 0], (STEP, RESTART)) & (events[:, 4] < events[:, 3])]
+    is_break = np.isin(events[:, EVENT_CAUSE], (STEP, RESTART))
+    back = events[is_break & (events[:, EVENT_STAMP] < events[:, EVENT_BEFORE])]
     repeats: list[tuple[int, int, int]] = []
     for row, stamp in sorted(zip(back[:, 2].tolist(), back[:, 4].tolist(), strict=True)):
         if repeats and row < repeats[-1][0] + repeats[-1][2]:

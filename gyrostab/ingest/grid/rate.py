@@ -75,14 +75,14 @@ class RateEstimate:
 
     rate: float  # sampling rate [Hz]
     error: float  # three standard errors of it [Hz]
-    counted: bool  # whether rows are placed by their count, not by their stamps
-    coarse: bool  # whether many rows share one stamp
-    raw: float  # rate before rounding to a plain number [Hz]
+    places_by_count: bool  # whether rows are placed by their count, not by their stamps
+    stamps_are_shared: bool  # whether many rows share one stamp
+    unrounded: float  # rate before rounding to a plain number [Hz]
     #: Rate [Hz] if the recurring losses found in the stamps are not losses, or if rows arrive in
     #: packets; None without these.
-    even: float | None = None
+    rate_without_losses: float | None = None
     #: Higher rate [Hz] near whose samples the stamps lie, if rows are missing; None without one.
-    finer: float | None = None
+    rate_with_losses: float | None = None
     #: Jitter of the stamps, if single stamps do not give the sample but many together do.
     jitter: JitterModel | None = None
 
@@ -143,7 +143,7 @@ def _estimate_ordered(stamps: Stamps, stretches: Parts, parts: Parts, sure: floa
     finer = None if counted else finer_period(filled, period)
     lost = None if finer is None else _estimate_sharp(stamps, parts, SECOND / finer)
     if lost is not None:
-        return replace(lost, even=float(f"{SECOND / time_per_row(stretches):.4g}"))
+        return replace(lost, rate_without_losses=float(f"{SECOND / time_per_row(stretches):.4g}"))
     is_uneven = step_scatter(steps, period) > _SHARP_SCATTER
     jitter: JitterModel | None = None
     combs: list[tuple[float, float]] = []
@@ -155,18 +155,18 @@ def _estimate_ordered(stamps: Stamps, stretches: Parts, parts: Parts, sure: floa
         if jitter is not None:
             finer_rate = _finer_rate(stretches, peaks, jitter, sure)
             estimate = _estimate_with_jitter(stamps, jitter, coarse, sure)
-            estimate = replace(estimate, finer=finer_rate)
+            estimate = replace(estimate, rate_with_losses=finer_rate)
         elif np.mean(steps == 0) >= SHARED_SHARE:  # rows are not doubled: that would fit
             period, counted, coarse = time_per_row(stretches, ticks=True), True, True
     if jitter is None:
         longest = longest_step(parts, period) if counted else sure * period
         estimate = _estimate_pooled(stamps, period, longest, counted=counted, coarse=coarse)
         finer_rate = None if finer is None else float(f"{SECOND / finer:.4g}")
-        estimate = replace(estimate, finer=finer_rate)
-    has_comb = any(abs(SECOND / estimate.raw / comb - 1) < PEAK_WIDTH for comb, _ in combs)
-    even = None if estimate.counted else packet_rate(stretches, estimate.rate)
+        estimate = replace(estimate, rate_with_losses=finer_rate)
+    has_comb = any(abs(SECOND / estimate.unrounded / comb - 1) < PEAK_WIDTH for comb, _ in combs)
+    even = None if estimate.places_by_count else packet_rate(stretches, estimate.rate)
     if even is None or not is_uneven or has_comb:
-        return replace(estimate, even=even)
+        return replace(estimate, rate_without_losses=even)
     # samples lie near multiples of a period across all pauses, and packets of rows do not
     period = time_per_row(stretches)
     return _estimate_pooled(stamps, period, longest_step(parts, period), counted=True)
@@ -289,9 +289,9 @@ def is_far_worse(stamps: Stamps, given: RateEstimate, estimated: RateEstimate) -
     True
     """
     jitter = estimated.jitter
-    if jitter is None and not estimated.counted:
+    if jitter is None and not estimated.places_by_count:
         _, stretches, _, sure = _sample_stamps(stamps)
-        jitter = fit_jitter_near(stretches, SECOND / estimated.raw, "all", sure=sure)
+        jitter = fit_jitter_near(stretches, SECOND / estimated.unrounded, "all", sure=sure)
     return (
         given.jitter is not None
         and jitter is not None

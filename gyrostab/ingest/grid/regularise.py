@@ -38,7 +38,15 @@ from gyrostab.ingest.grid.place_rows import RowPlacer
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, record_name, scan_rows
 from gyrostab.ingest.limits import check_limits
 from gyrostab.ingest.uniform import as_uniform, check_same_rate
-from gyrostab.kernels.grid.stamps import NO_STAMP, RESTART, STEP
+from gyrostab.kernels.grid.stamps import (
+    EVENT_CAUSE,
+    EVENT_ROW,
+    EVENT_SAMPLE,
+    EVENT_STAMP,
+    NO_STAMP,
+    RESTART,
+    STEP,
+)
 from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts
 from gyrostab.store.lazy import read_slice
 from gyrostab.store.write import chunk_samples
@@ -67,12 +75,12 @@ _OWN_ATTRIBUTES = (
 
 def _is_on_grid(channel: Any, n_filled: int, scanned: ScanPass, placement: Placement) -> bool:
     """Whether a channel has values for most samples, and few in rows without a gyro value."""
-    present = scanned.rows - scanned.absent
+    present = scanned.row_count - scanned.absent_count
     if n_filled <= 0.5 * present:
         return False
-    if scanned.absent <= _MAX_UNPLACED_SHARE * n_filled:
+    if scanned.absent_count <= _MAX_UNPLACED_SHARE * n_filled:
         return True  # without reading the channel
-    dropped = max(0, present - placement.placed)  # they lose their channels too
+    dropped = max(0, present - placement.placed_count)  # they lose their channels too
     placed = 0
     for begin in range(0, channel.shape[0], BLOCK_ROWS):
         block = read_slice(channel, begin, min(begin + BLOCK_ROWS, channel.shape[0]))
@@ -87,7 +95,7 @@ def _place_channels(
     """Return the channels on the grid, and time coordinates of slow channels."""
     variables: dict[str, Any] = {}
     coordinates: dict[str, Any] = {}
-    for name, rows in scanned.filled.items():
+    for name, rows in scanned.filled_counts.items():
         channel = raw[name]
         if _is_on_grid(channel.data, rows, scanned, placement):
             variables[name] = (
@@ -304,7 +312,9 @@ def _place_log(
         .merge(time_coordinate(start, hertz, size))
         .coords
     )
-    done = f"{placement.placed} of {scanned.rows} rows on {size} samples at {hertz:.10g} Hz"
+    done = (
+        f"{placement.placed_count} of {scanned.row_count} rows on {size} samples at {hertz:.10g} Hz"
+    )
     log = xr.Dataset(variables, coordinates, _log_attributes(raw, kind, hertz, done, notes))
     if placement.rate_changes:
         log.attrs["rate_changes"] = list(map(format_stamp, placement.rate_changes))
@@ -351,11 +361,10 @@ def gather_channel(
 ) -> tuple[NDArray[np.datetime64], Floats]:
     """Return stamps and values of the filled rows of a slow channel."""
     channel = raw[name].data
-    breaks = placement.events[np.isin(placement.events[:, 0], (STEP, RESTART))]
-    breaks = breaks[np.argsort(breaks[:, 2], kind="stable")]
-    moved = np.concatenate(
-        [[0], grid_times(placement.start, placement.rate, breaks[:, 1] + 1) - breaks[:, 4]]
-    )
+    breaks = placement.events[np.isin(placement.events[:, EVENT_CAUSE], (STEP, RESTART))]
+    breaks = breaks[np.argsort(breaks[:, EVENT_ROW], kind="stable")]
+    grid_stamps = grid_times(placement.start, placement.rate, breaks[:, EVENT_SAMPLE] + 1)
+    moved = np.concatenate([[0], grid_stamps - breaks[:, EVENT_STAMP]])
     stamps, values = [], []
     for begin in range(0, channel.shape[0], BLOCK_ROWS):
         end = min(begin + BLOCK_ROWS, channel.shape[0])
@@ -367,7 +376,7 @@ def gather_channel(
         if "time" in raw.variables and not has_time.all():
             written = read_stamps(raw, begin, end)[rows]
             moved_stamps = (
-                written + moved[np.searchsorted(breaks[:, 2], rows + begin, side="right")]
+                written + moved[np.searchsorted(breaks[:, EVENT_ROW], rows + begin, side="right")]
             )
             when = np.where(has_time, when, moved_stamps)
             has_time |= written != NO_STAMP

@@ -29,27 +29,27 @@ BLOCK_ROWS = 1 << 20
 class ScanPass:
     """Findings of one pass over a raw log."""
 
-    rows: int  # rows of the raw log
-    present: NDArray[np.uint8]  # one bit a row: whether any axis has a number
-    absent: int  # rows without any number
+    row_count: int  # of the raw log
+    present_bits: NDArray[np.uint8]  # one bit a row: whether any axis has a number
+    absent_count: int  # rows without any number
     #: (n, 2): half-open spans of present rows in which an axis is NaN, or infinite.
     unreadable: Ints
     infinite: Ints
     constant: list[str]  # axes whose value never changes
     empty: list[str]  # axes without a number
     #: Channel on ``row`` -> number of rows with a value.
-    filled: dict[str, int] = field(default_factory=dict)
-    repeated: int = 0  # number of rows that repeat others
+    filled_counts: dict[str, int] = field(default_factory=dict)
+    repeated_count: int = 0  # rows that repeat others
 
     def leave_out(self, rows: Ints) -> None:
         """Mark rows as repetitions, which hold no new sample."""
         bits = (128 >> rows % 8).astype(np.uint8)
-        self.repeated += int(np.count_nonzero(self.present[rows // 8] & bits))
-        np.bitwise_and.at(self.present, rows // 8, ~bits)
+        self.repeated_count += int(np.count_nonzero(self.present_bits[rows // 8] & bits))
+        np.bitwise_and.at(self.present_bits, rows // 8, ~bits)
 
     def mask(self, begin: int, end: int) -> Bools:
         """Return which of the rows `begin` to `end` hold a sample."""
-        bits = np.unpackbits(self.present[begin // 8 : -(-end // 8)])
+        bits = np.unpackbits(self.present_bits[begin // 8 : -(-end // 8)])
         return bits[begin % 8 : begin % 8 + end - begin].astype(bool)
 
 
@@ -113,14 +113,14 @@ def stamp_blocks(raw: xr.Dataset, scanned: ScanPass, *, all_rows: bool = False) 
     """Yield row numbers and stamps [ns] (or `NO_STAMP`) of rows with a sample, in blocks."""
 
     def read_block(begin: int) -> Block:
-        end = min(scanned.rows, begin + BLOCK_ROWS)
+        end = min(scanned.row_count, begin + BLOCK_ROWS)
         values = read_stamps(raw, begin, end)
-        if not scanned.repeated and (all_rows or scanned.absent == 0):
+        if not scanned.repeated_count and (all_rows or scanned.absent_count == 0):
             return np.arange(begin, end), values
         keep = scanned.mask(begin, end)
         return np.flatnonzero(keep) + begin, values[keep]
 
-    return map_in_order(read_block, range(0, scanned.rows, BLOCK_ROWS), workers=1)
+    return map_in_order(read_block, range(0, scanned.row_count, BLOCK_ROWS), workers=1)
 
 
 def _source_names(raw: xr.Dataset) -> list[str]:

@@ -23,6 +23,11 @@ _EXCHANGED = 0.25  # of the stamp of an exchanged row from its sample: half of w
 # what happened to a row, numbered as in schema.GAP_CAUSES
 _ON_TIME, _BY_COUNT, DUPLICATE, OUT_OF_ORDER, STEP, RESTART = 0, 1, 2, 3, 5, 6
 
+#: Columns of the events: what happened to a row, its sample, the row, the stamp of the row before
+#: and its own stamp [ns].
+EVENT_CAUSE, EVENT_SAMPLE, EVENT_ROW, EVENT_BEFORE, EVENT_STAMP = range(5)
+EVENT_COLUMNS = 5
+
 # places in the state: integers and stamps
 _HEAD, _ROW, _RUN_GRID, _RUN_ROW, _RUN_LENGTH, _PENDING, _PENDING_ROW = range(7)
 _GRID0, _STAMP0, _LATEST, FIRST, STARTED, _PHASE = range(7, 13)
@@ -286,11 +291,11 @@ def _add_run(runs, n, sample, row, length):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _note_event(events, n, cause, sample, row, before, stamp):  # type: ignore[no-untyped-def]
-    events[n, 0] = cause
-    events[n, 1] = sample
-    events[n, 2] = row
-    events[n, 3] = before
-    events[n, 4] = stamp
+    events[n, EVENT_CAUSE] = cause
+    events[n, EVENT_SAMPLE] = sample
+    events[n, EVENT_ROW] = row
+    events[n, EVENT_BEFORE] = before
+    events[n, EVENT_STAMP] = stamp
     return n + 1
 
 
