@@ -304,6 +304,11 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
         log_attrs["unreadable_cells"] = count
         log_attrs["notes"] = [f"DataArray: {count} gyro cells are infinite and become NaN"]
     bare = _convert_channels(_decode_packed(_reset_channels(array.coords.to_dataset())))
+    if unusable := find_unusable_channels(bare.reset_coords()):
+        log_attrs["notes"] = [
+            *log_attrs.get("notes", ()),
+            *(f"DataArray: {key!r} is left out: {reason}" for key, reason in unusable.items()),
+        ]
     bare = bare.drop_vars([coord for coord in bare.coords if coord not in ("time", "axis")])
     log = bare.assign({name: (("axis", "time"), data, attrs, packing)})
     return log.assign_coords(axis=axes).assign_attrs(log_attrs), increments

@@ -183,13 +183,15 @@ def test_coordinates_of_a_dataarray_are_channels(present):
         "time": time,
         "temperature": ("time", 32 + 1.8 * warm, {"units": "degF"}),
         "run": 7,
+        "pump": ("time", ["on", "off"] * 200),
     }
     data = xr.DataArray(np.ones(400), coordinates, ("time",), attrs={"units": "deg/h"})
-    log = gyrostab.from_dataarray(data[present])
+    with pytest.warns(UserWarning, match="'pump' is left out: it holds text"):
+        log = gyrostab.from_dataarray(data[present])
     np.testing.assert_allclose(log["temperature"].sel(time=time[present]), warm[present])
     assert log["temperature"].attrs["units"] == "degree_Celsius"
     assert "run" not in log.variables
-    surface = gyrostab.davar(data[present], window="2s")
+    surface = gyrostab.davar(data[present].drop_vars("pump"), window="2s")
     assert float(surface["temperature"][0]) == pytest.approx(warm[:100].mean())
 
 

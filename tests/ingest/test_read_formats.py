@@ -316,6 +316,16 @@ def test_gyro_axes_of_netcdf_are_on_a_shorter_dimension(tmp_path: Path, name: st
     assert raw.axis.values.tolist() == ["x"]
 
 
+@pytest.mark.parametrize("form", ["NETCDF4", "NETCDF3_CLASSIC"])  # strings, characters
+def test_text_of_netcdf_is_left_out_with_a_note(tmp_path: Path, form: Any) -> None:
+    rate = ("time", np.arange(50.0), {"units": "deg/h"})
+    pump = ("time", np.where(np.arange(50) < 20, "on", "off"))
+    log = xr.Dataset({"gyro_x": rate, "pump": pump})
+    log.to_netcdf(tmp_path / "a.nc", format=form)
+    notes = read_log(tmp_path / "a.nc", rate=10.0).attrs["notes"]
+    assert "a.nc: left out, as they hold text, not numbers: pump" in notes
+
+
 def test_masked_netcdf_cells_are_missing(tmp_path: Path) -> None:
     path = tmp_path / "packed.nc"
     since = {"units": "milliseconds since 2026-01-01", "_FillValue": -1}
