@@ -390,6 +390,26 @@ def test_plain_hdf5_with_units_as_attributes(tmp_path: Path) -> None:
     assert scan_file(path).format == "hdf5"
 
 
+def test_groups_of_hdf5_with_other_rates_are_channels(tmp_path: Path) -> None:
+    lengths = {"imu/gyro_x": 200, "acc/accel_x": 800, "env/temperature": 20, "odd/spare": 7}
+    units = ("deg/h", "g", "degC", "V")
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for (name, length), unit in zip(lengths.items(), units, strict=True):
+            file[name] = np.arange(float(length))
+            file[name].attrs["units"] = unit
+            if unit != "V":
+                clock = file.create_dataset(f"{name[:3]}/time", data=np.arange(length) * 8 / length)
+                clock.attrs["units"] = "s"
+    raw = read_log(tmp_path / "log.h5")
+    assert raw.rate.values.tolist() == [list(range(200))]
+    assert raw.sizes["time_accel_x"] == 800
+    second = np.timedelta64(1, "s")
+    seconds = (raw["time_temperature"].values - raw["time"].values[0]) / second
+    np.testing.assert_allclose(seconds, np.arange(20) * 0.4)
+    np.testing.assert_array_equal(raw["temperature"], np.arange(20))
+    assert any("left out" in note and "odd.spare" in note for note in raw.attrs["notes"])
+
+
 def test_hdf5_with_a_filter_of_netcdf_is_read(tmp_path: Path) -> None:
     values = np.arange(500) / 100
     columns = {"time": (values, "s"), "gyro_x": (values, "deg/h")}
