@@ -497,6 +497,17 @@ def test_minus_signs_of_typography_are_read(tmp_path: Path, ending: str) -> None
     assert scan_file(path).first == plain.time[0]
 
 
+def test_negative_numbers_of_spreadsheets_are_in_parentheses(tmp_path: Path) -> None:
+    rows = "".join(
+        f"{n};" + (f"{x},25" if x >= 0 else f"({-x},25)") + "\n"
+        for n, x in enumerate(range(-12, 12))
+    )
+    raw = read_log(write(tmp_path, "time [s];gyro_x [deg/h]\n" + rows))
+    expected = [x + (0.25 if x >= 0 else -0.25) for x in range(-12, 12)]
+    assert raw.rate.values.tolist() == [expected]
+    assert not any("unreadable" in note for note in raw.attrs["notes"])
+
+
 def test_exponents_of_fortran_are_read(tmp_path: Path) -> None:
     rows = "".join(f"{n},{n - 3}.5D-01,{n}d0\n" for n in range(20))
     raw = read_log(write(tmp_path, "time [s],gyro_x [deg/h],gyro_y [deg/h]\n" + rows))
