@@ -31,6 +31,8 @@ _MAX_CHANGE_AT_REST_DPH = 30.082
 #: Largest ratio of the scatter next to gaps to that elsewhere (median of the windows) that is not
 #: reported: at least 1.7 standard deviations in a record of one window with few gaps.
 _MAX_EDGE_RATIO = 1.25
+#: Largest Allan deviation of a constant axis, divided by its mean: rounding errors.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -135,6 +137,21 @@ def _summarise_term(part: xr.Dataset, axis: str, symbol: str) -> TermSummary:
         limit,
         *shares,
     )
+
+
+def find_constant_axes(product: xr.Dataset) -> list[str]:
+    """Find the axes whose values differ by no more than rounding errors.
+
+    Examples
+    --------
+    >>> from gyrostab import davar, make_log
+    >>> rate = np.array([np.full(600, 0.1), np.random.default_rng(1).standard_normal(600)])
+    >>> find_constant_axes(davar(make_log(rate, rate=10.0, unit="deg/h"), window="1min"))
+    ['x']
+    """
+    rounding = (_ROUNDING * abs(product["window_mean"]).max("time")) ** 2
+    is_constant = product["avar"].max(("time", "tau")) <= rounding
+    return [str(axis) for axis in product["axis"].values[is_constant.values]]
 
 
 def _drop_nans(values: Floats) -> Floats:

@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from gyrostab.arrays import Array, Floats, Ints
@@ -302,7 +303,10 @@ def _files_without(groups: list[list[xr.Dataset]], holders: set[int]) -> list[st
 
 
 def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Add the channels of other files, each on ``time_<channel>`` with its filled rows only."""
+    """Add the channels of other files, each on ``time_<channel>`` with its filled rows only.
+
+    A row that several files hold, with one stamp and value, counts once.
+    """
     pieces: dict[str, list[tuple[Array, Array, str]]] = {}
     files = [source.attrs["source_files"][0] for source in sources]
     for name, source in zip(files, sources, strict=True):
@@ -325,10 +329,19 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
             array * conversion[0] + conversion[1] if conversion else array
             for array, conversion in zip(values_of_files, conversions, strict=True)
         ]
-        stamps, values = np.concatenate(stamps_of_files), np.concatenate(numbers)
-        order, dim = np.argsort(stamps, kind="stable"), f"time_{channel}"
-        log = log.assign_coords({dim: (dim, stamps[order])}).assign(
-            {channel: (dim, values[order], {"units": file_units[0]})}
+        rows = pd.DataFrame(
+            {
+                "stamp": np.concatenate(stamps_of_files),
+                "value": np.concatenate(numbers),
+                "file": np.repeat(np.arange(len(numbers)), list(map(len, numbers))),
+            }
+        )
+        if len(numbers) > 1:  # a row that several files hold is that of the first
+            first = rows.groupby(["stamp", "value"])["file"].transform("min")
+            rows = rows[rows["file"] == first]
+        rows, dim = rows.sort_values("stamp", kind="stable"), f"time_{channel}"
+        log = log.assign_coords({dim: (dim, rows["stamp"].to_numpy())}).assign(
+            {channel: (dim, rows["value"].to_numpy(), {"units": file_units[0]})}
         )
     return log
 

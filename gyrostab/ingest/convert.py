@@ -23,6 +23,7 @@ from gyrostab.errors import (
 from gyrostab.ingest.columns.headers import quantity_of
 from gyrostab.ingest.combine import warn_notes
 from gyrostab.ingest.dataframe import from_dataframe, keyword_advice
+from gyrostab.ingest.formats.packing import Packing
 from gyrostab.ingest.uniform import advise_dates, as_uniform
 from gyrostab.schema import (
     RESERVED_NAMES,
@@ -33,7 +34,8 @@ from gyrostab.schema import (
     name_axes,
     refuse_multi_index,
 )
-from gyrostab.store.lazy import hide_infinite
+from gyrostab.store.cf import DECODING
+from gyrostab.store.lazy import convert_lazy, hide_infinite
 from gyrostab.store.private import is_in_memory
 from gyrostab.store.read import MIN_LAZY_VALUES, make_variable_lazy
 from gyrostab.store.write import declare_counts
@@ -73,7 +75,7 @@ def as_log(data: Any, *, converts_units: bool = True) -> xr.Dataset:
         with _advise_conversion("gyrostab.from_dataframe(df, ...)"):
             return from_dataframe(data)
     if isinstance(data, xr.Dataset):
-        data = _reset_channels(_keep_on_disk(data))
+        data = _decode_packed(_reset_channels(_keep_on_disk(data)))
         data = _convert_channels(data) if converts_units else data
     return as_uniform(data)
 
@@ -89,6 +91,30 @@ def _reset_channels(log: xr.Dataset) -> xr.Dataset:
         and array.dtype.kind in "iuf"
     ]
     return log.reset_coords(coordinates) if coordinates else log
+
+
+def _decode_packed(log: xr.Dataset) -> xr.Dataset:
+    """Decode the signal and channels that xarray has read without decoding (`mask_and_scale`)."""
+    names = {"rate", "angle", *log_channels(log)} & set(log.data_vars)
+    packed = {name: log.variables[name] for name in names if _is_packed(log.variables[name])}
+    return log.assign({name: _decode_variable(name, array) for name, array in packed.items()})
+
+
+def _is_packed(variable: xr.Variable) -> bool:
+    """Whether attributes say how integers are decoded; decoded values are floats."""
+    return variable.dtype.kind in "iu" and not DECODING.isdisjoint(variable.attrs)
+
+
+def _decode_variable(name: Any, variable: xr.Variable) -> xr.Variable:
+    packing = Packing.from_attributes(str(name), variable.dtype, variable.attrs)
+    data = variable.data
+    values = (
+        convert_lazy(data, packing.read_values, np.dtype(float))
+        if hasattr(data, "dask")
+        else packing.read_values(data)
+    )
+    attrs = {key: value for key, value in variable.attrs.items() if key not in DECODING}
+    return xr.Variable(variable.dims, values, attrs)
 
 
 def _convert_channels(log: xr.Dataset) -> xr.Dataset:
@@ -262,6 +288,8 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
     axes = name_axes(da)
     array = da if "axis" in da.dims else da.drop_vars("axis", errors="ignore").expand_dims("axis")
     signal = array.variable.transpose("axis", "time")
+    if _is_packed(signal):
+        signal = _decode_variable(da.name or "DataArray", signal)
     given = signal.data  # read once: xarray reads a variable of a file anew
     values = hide_infinite(given)
     data = values * unit.factor if unit.factor != 1.0 else values
@@ -270,12 +298,17 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
         if signal.dtype.kind in "iu" and not increments
         else {}
     )
-    attrs = {"long_name": SIGNAL_LONG_NAMES[name], **da.attrs, "units": SIGNAL_UNITS[name]}
+    attrs = {"long_name": SIGNAL_LONG_NAMES[name], **signal.attrs, "units": SIGNAL_UNITS[name]}
     log_attrs: dict[str, Any] = {"kind": name}
     if isinstance(values, np.ndarray) and (count := int(np.isinf(given).sum())):
         log_attrs["unreadable_cells"] = count
         log_attrs["notes"] = [f"DataArray: {count} gyro cells are infinite and become NaN"]
-    bare = _convert_channels(_reset_channels(array.coords.to_dataset()))
+    bare = _convert_channels(_decode_packed(_reset_channels(array.coords.to_dataset())))
+    if unusable := find_unusable_channels(bare.reset_coords()):
+        log_attrs["notes"] = [
+            *log_attrs.get("notes", ()),
+            *(f"DataArray: {key!r} is left out: {reason}" for key, reason in unusable.items()),
+        ]
     bare = bare.drop_vars([coord for coord in bare.coords if coord not in ("time", "axis")])
     log = bare.assign({name: (("axis", "time"), data, attrs, packing)})
     return log.assign_coords(axis=axes).assign_attrs(log_attrs), increments

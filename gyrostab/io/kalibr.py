@@ -38,7 +38,13 @@ import xarray as xr
 
 from gyrostab.allan.davar import davar
 from gyrostab.allan.fit import fit_noise
-from gyrostab.allan.summary import FitSummary, TermSummary, summarise_fit, summarise_terms
+from gyrostab.allan.summary import (
+    FitSummary,
+    TermSummary,
+    find_constant_axes,
+    summarise_fit,
+    summarise_terms,
+)
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.ingest.convert import as_log
 from gyrostab.ingest.make_log import make_log
@@ -178,11 +184,17 @@ def to_kalibr(
         "# Noise of a gyro for Kalibr: medians over the windows of a dynamic Allan variance, "
         "made by gyrostab",
         f"# from {', '.join(names) or 'a log'}. At the top the worst axis, below each of them.",
+        "# null: a longer window (--window) may show the term, if the sensor works.",
         "# Kalibr also asks for rostopic."
         if log is not None
         else "# Kalibr also asks for rostopic, accelerometer_noise_density and "
         "accelerometer_random_walk: give the log too, as log (--log), if it has accelerations.",
         *(_describe_fit(fit) for fit in summarise_fit(product)),
+        *(
+            f"# {sensor} axis {axis} is constant: its sensor is dead, or its column the wrong one"
+            for sensor, (part, _) in fitted.items()
+            for axis in find_constant_axes(part)
+        ),
         f"update_rate: {float(rate)!r}  # Hz",
     ]
     noise = {sensor: convert_terms(*part) for sensor, part in fitted.items()}
@@ -233,8 +245,7 @@ def _format_entry(key: str, term: TermSummary, *, indent: str) -> list[str]:
         f"observed in {100 * term.observed_share:.0f} % of the windows",
         "upper_limit_only": f"{unit}; 95 % UPPER LIMIT of {symbol} ({name}), "
         f"in {100 * term.limited_share:.0f} % of the windows",
-        "not_observable": f"{unit}; not observable in any window: "
-        f"a longer window (--window) may show {symbol} ({name})",
+        "not_observable": f"{unit}; {symbol}, {name}, not observable in any window",
     }[term.status]
     number = "null" if math.isnan(term.value) else f"{term.value:.6e}"
     return [f"{indent}{key}: {number}  # {comment}", f"{indent}{key}_meaning: {term.status}"]

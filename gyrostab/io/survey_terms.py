@@ -34,7 +34,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 import xarray as xr
 
-from gyrostab.allan.summary import TermSummary, summarise_fit, summarise_terms
+from gyrostab.allan.summary import TermSummary, find_constant_axes, summarise_fit, summarise_terms
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.io.survey_model import KINDS, TABLES, Groups, Status, SurveyModel, SurveyTerm, Tool
 from gyrostab.noise import LAWS
@@ -60,10 +60,6 @@ class _Magnitude(NamedTuple):
     low: float
     high: float
     status: Status
-
-
-#: Largest Allan deviation of a constant axis, over its mean: rounding errors.
-_ROUNDING = 1e-9
 
 
 def drift_rate(n: float, b: float, k: float, *, section: float, calibration: float) -> float:
@@ -169,7 +165,7 @@ def survey_terms(
     ]
     if all(math.isnan(term.value) for term in terms if term.unit != "deg/h/g"):
         silent = [axis for axis, walk in magnitudes["walk"].items() if math.isnan(walk.value)]
-        constant = [axis for axis in silent if _is_constant(product.sel(axis=axis))]
+        constant = [axis for axis in find_constant_axes(product) if axis in silent]
         if constant:
             raise SchemaError(
                 f"axis {', '.join(constant)} is constant: its sensor is dead, or its column the "
@@ -187,12 +183,6 @@ def survey_terms(
         _describe_origin(product, times, statistic),
         (_CONFIRM, *_make_notes(product, terms, times["section"], content)),
     )
-
-
-def _is_constant(part: xr.Dataset) -> bool:
-    """Check whether the values of an axis differ by no more than rounding errors."""
-    rounding = (_ROUNDING * float(np.abs(part["window_mean"]).max())) ** 2
-    return float(part["avar"].max()) <= rounding
 
 
 def _make_term(

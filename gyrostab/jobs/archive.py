@@ -43,6 +43,8 @@ RESERVED_NAMES = (
     FLEET_MARK, "effects.parquet", "files.parquet", "index.html", "index.parquet", "reports",
     "trends.parquet",
 )  # fmt: skip
+#: Names of devices, which files and folders of Windows cannot have, also before a suffix.
+_DEVICE_NAME = re.compile(r"(?i)^(con|prn|aux|nul|(?:com|lpt)[1-9])(?=\.|$)")
 #: Format of a folder that ``gyrostab diagnose`` wrote, in the table of files.
 DIAGNOSIS = "diagnosis"
 #: Bytes at the beginning of a diagnosis that contain the name of its schema, its first entry.
@@ -317,7 +319,7 @@ def find_runs(
 def _name_groups(groups: Mapping[Path, list[Path]], base: Path, per: str) -> dict[str, list[Path]]:
     """Name runs by their place below `base`; no run is inside another one.
 
-    Names differ by more than case, which file systems of Windows and macOS do not distinguish.
+    Windows and macOS can hold them: names differ by more than case, and are not names of devices.
     """
     bare = {path: path.with_name(path.name.split(".")[0] or path.name) for path in groups}
     is_shared = len({str(path).casefold() for path in bare.values()}) < len(bare)
@@ -330,7 +332,7 @@ def _name_groups(groups: Mapping[Path, list[Path]], base: Path, per: str) -> dic
                 f"{path}: is not inside {base}, the folder of the table of files; "
                 "make the table again with gyrostab index"
             )
-        names[path] = "/".join(part.replace("\\", "_") for part in parts)
+        names[path] = "/".join(_DEVICE_NAME.sub(r"\1_", part.replace("\\", "_")) for part in parts)
     above = {
         "/".join(name.split("/")[:depth])
         for name in names.values()

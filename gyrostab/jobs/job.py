@@ -24,7 +24,13 @@ import numpy as np
 
 from gyrostab.errors import OutputError, ResumeError
 from gyrostab.store.attributes import find_version
-from gyrostab.store.output import describe_file, is_leftover, remove_leftovers, write_text
+from gyrostab.store.output import (
+    describe_file,
+    hide_name,
+    is_leftover,
+    remove_leftovers,
+    write_text,
+)
 from gyrostab.store.output.content import read_json
 from gyrostab.store.remote import find_url, full_name
 from gyrostab.store.system import lock_file
@@ -45,8 +51,9 @@ def job_folder(output: Path) -> Path:
     False
     """
     if url := find_url(output):
-        return Path(f".{output.name}-{hashlib.sha256(url.encode()).hexdigest()[:8]}.job")
-    return output.with_name(f".{output.name}.job")
+        mark = hashlib.sha256(url.encode()).hexdigest()[:8]
+        return Path(hide_name(f"{output.name}-{mark}", ".job"))
+    return output.with_name(hide_name(output.name, ".job"))
 
 
 def check_job_folder(folder: Path) -> None:

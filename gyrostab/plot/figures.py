@@ -80,7 +80,8 @@ def save_figures(
     Returns
     -------
     list of pathlib.Path
-        Files, named as in `product_figures`.
+        Files, named as in `product_figures`. Names that no file can have, or that differ only by
+        case, get underscores.
 
     Raises
     ------
@@ -91,10 +92,12 @@ def save_figures(
         figure is written.
     """
     folder = Path(folder)
-    figures = {
-        re.sub(r"[^\w.-]", "_", name) + ".png": draw
-        for name, draw in product_figures(product, width=width).items()
-    }
+    figures: dict[str, Callable[[], Figure]] = {}
+    for name, draw in product_figures(product, width=width).items():
+        stem = re.sub(r"[^\w.-]", "_", name)
+        while f"{stem}.png".casefold() in map(str.casefold, figures):
+            stem += "_"
+        figures[f"{stem}.png"] = draw
     check_folder(folder, figures, overwrite=overwrite)
     with new_folder(folder, overwrite=overwrite) as temporary:
         for name, draw in figures.items():

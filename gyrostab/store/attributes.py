@@ -27,13 +27,29 @@ from gyrostab.time.stamps import time_of_day
 from gyrostab.units import ON_DISK, on_disk
 
 _CONVENTIONS = "CF-1.11, ACDD-1.3"
-_TITLES = {
-    "product": "Dynamic Allan variance of a gyro log, "
-    "with the noise coefficients Q, N, B, K and R of every window",
-    "surface": "Dynamic Allan variance of a gyro log",
-    "log": "Gyro log on a uniform time axis",
-    "dataset": "Gyro stability data",
+#: Attribute that describes a file -> its text for each kind.
+_DESCRIPTIONS = {
+    "title": {
+        "product": "Dynamic Allan variance of a gyro log, "
+        "with the noise coefficients Q, N, B, K and R of every window",
+        "surface": "Dynamic Allan variance of a gyro log",
+        "log": "Gyro log on a uniform time axis",
+        "dataset": "Gyro stability data",
+    },
+    "summary": {
+        "product": "Allan variance of each axis of a gyro by time and averaging time, in windows "
+        "that slide along the log, and the five noise terms of IEEE Std 952 fitted to each window: "
+        "quantization Q, angle random walk N, bias instability B, rate random walk K and rate ramp "
+        "R, with standard errors and 95 % upper limits. Missing samples are left out, not "
+        "interpolated.",
+        "surface": "Allan variance of each axis of a gyro by time and averaging time, in windows "
+        "that slide along the log. Missing samples are left out, not interpolated.",
+        "log": "Rotation rate or angle of each axis of a gyro and the channels that were logged "
+        "with it, with missing samples as NaN and a table of the gaps.",
+        "dataset": "Results of an analysis of gyro noise.",
+    },
 }
+_KEYWORDS = "gyroscope, rotation rate, noise, stability, Allan variance"
 JSON_NAMES = "json_attributes"
 _NETCDF_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
 
@@ -108,7 +124,7 @@ def find_version(package: str) -> str:
 
 
 def make_global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[str, Any]:
-    """Make the attributes of a file: those of the dataset, with title, history and version."""
+    """Make the attributes of a file: those of the dataset, its description, history and version."""
     now, version = time_of_day(), find_version("gyrostab")
     attrs = dict(dataset.attrs)
     history = attrs.get("history", "")
@@ -117,9 +133,12 @@ def make_global_attributes(dataset: xr.Dataset, kind: str, verb: str) -> dict[st
         [*filter(None, lines), f"{now} gyrostab {version}: {verb}, {kind}"]
     )
     variance = VARIANCES.get(str(attrs.get("variance")), VARIANCES["avar"]).text
-    titles = {name: text.replace("Allan", variance) for name, text in _TITLES.items()}
-    if attrs.get("title") in (None, *titles.values()):  # also a title of an earlier stage
-        attrs["title"] = titles[kind]
+    for attribute, by_kind in _DESCRIPTIONS.items():
+        descriptions = {name: text.replace("Allan", variance) for name, text in by_kind.items()}
+        # the text of an earlier stage is replaced too
+        if attrs.get(attribute) in (None, *descriptions.values()):
+            attrs[attribute] = descriptions[kind]
+    attrs.setdefault("keywords", _KEYWORDS)
     names = texts(dataset, "source_files")
     source = "gyro log: " + ", ".join(names) if names else "gyro log"
     attrs.setdefault("source", source.encode("ascii", "backslashreplace").decode())

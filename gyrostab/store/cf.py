@@ -51,7 +51,7 @@ _LONG_NAMES = {**SIGNAL_LONG_NAMES, "axis": VARIABLES["axis"]["long_name"]}
 #: What the encoding of integer counts consists of, where a reader declares them.
 PACKING = ("dtype", "scale_factor", "add_offset")
 #: Attributes by which readers decode stored numbers; numbers in memory are decoded.
-_DECODING = {"_FillValue", "missing_value", "_Unsigned", "scale_factor", "add_offset"}
+DECODING = {"_FillValue", "missing_value", "_Unsigned", "scale_factor", "add_offset"}
 
 
 def find_kind(dataset: xr.Dataset) -> str:
@@ -85,7 +85,7 @@ def to_disk(
     variables: dict[Any, xr.Variable] = {}
     for name, variable in dataset.variables.items():
         variable = _convert_type(name, variable)
-        known_attrs = {key: item for key, item in variable.attrs.items() if key not in _DECODING}
+        known_attrs = {key: item for key, item in variable.attrs.items() if key not in DECODING}
         if name in grids:
             encode = encode_all_stamps if stamps else encode_first_stamp
             variables[name if stamps else f"{name}_start"] = encode(

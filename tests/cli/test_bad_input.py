@@ -239,6 +239,13 @@ def test_a_name_that_is_too_long_is_bad_input(make, log, tmp_path, monkeypatch, 
     assert re.fullmatch(rf"gyrostab: .*{name}\S*: File name too long.*", message), message
 
 
+def test_a_product_may_have_a_name_of_the_greatest_length(log, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    product = 252 * "n" + ".nc"
+    assert call("run", log, "-o", product, *WINDOW) == 0
+    assert os.listdir() == [product]
+
+
 @pytest.mark.parametrize("options", [
     "--taus banana", "--taus 0", "--tau-max banana", "--step 0s", "--terms XYZ",
     "--fit-from banana", "--fit-to 0s", "--exclude 1min", "--exclude 1min/banana", "--from banana",

@@ -10,6 +10,7 @@ import xarray as xr
 
 import gyrostab
 from gyrostab.errors import MissingUnitError, OptionError, UnitError
+from gyrostab.ingest.convert import as_log
 from gyrostab.ingest.make_log import make_log
 
 VALUES = np.random.default_rng(1).standard_normal(50)
@@ -182,13 +183,15 @@ def test_coordinates_of_a_dataarray_are_channels(present):
         "time": time,
         "temperature": ("time", 32 + 1.8 * warm, {"units": "degF"}),
         "run": 7,
+        "pump": ("time", ["on", "off"] * 200),
     }
     data = xr.DataArray(np.ones(400), coordinates, ("time",), attrs={"units": "deg/h"})
-    log = gyrostab.from_dataarray(data[present])
+    with pytest.warns(UserWarning, match="'pump' is left out: it holds text"):
+        log = gyrostab.from_dataarray(data[present])
     np.testing.assert_allclose(log["temperature"].sel(time=time[present]), warm[present])
     assert log["temperature"].attrs["units"] == "degree_Celsius"
     assert "run" not in log.variables
-    surface = gyrostab.davar(data[present], window="2s")
+    surface = gyrostab.davar(data[present].drop_vars("pump"), window="2s")
     assert float(surface["temperature"][0]) == pytest.approx(warm[:100].mean())
 
 
@@ -199,6 +202,26 @@ def test_an_array_of_a_file_without_infinite_values_has_no_note(tmp_path):
     with xr.open_dataset(path) as stored:
         log = gyrostab.from_dataarray(stored["rate"])
     assert "notes" not in log.attrs
+
+
+@pytest.mark.parametrize("chunks", [None, {}])
+@pytest.mark.parametrize("make", [gyrostab.from_dataarray, as_log])
+def test_integers_that_xarray_has_not_decoded_are_decoded(make, chunks, tmp_path):
+    time = pd.date_range("2026-05-01", periods=5, freq="10ms")
+    rate, temperature = [[0.5, 1.0, np.nan, -2.0, 3.0]], [20.5, 20.5, 21.0, 21.0, 21.5]
+    log = xr.Dataset(
+        {"rate": (("axis", "time"), rate, {"units": "degree hour-1"})},
+        {"time": time, "axis": ["x"]},
+    )
+    log["temperature"] = "time", temperature, {"units": "degree_Celsius"}
+    packing = {"dtype": "i2", "scale_factor": 0.5, "add_offset": 5.0, "_FillValue": -99}
+    log.to_netcdf(tmp_path / "log.nc", encoding=dict.fromkeys(["rate", "temperature"], packing))
+    with xr.open_dataset(tmp_path / "log.nc", mask_and_scale=False, chunks=chunks) as stored:
+        assert stored["rate"].dtype == np.int16
+        given = stored["rate"].assign_coords(temperature=stored["temperature"])
+        made = make(given if make is gyrostab.from_dataarray else stored).load()
+    np.testing.assert_array_equal(made["rate"], rate)
+    np.testing.assert_array_equal(made["temperature"], temperature)
 
 
 def test_a_channel_is_not_called_like_a_dimension_of_texts_in_a_file(tmp_path):

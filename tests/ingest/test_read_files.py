@@ -361,6 +361,20 @@ def test_channels_of_another_file_keep_their_own_time(tmp_path: Path) -> None:
     assert joined.attrs["channel_files"] == ["slow.csv", "more.csv"]
 
 
+def test_a_row_of_overlapping_channel_files_counts_once(tmp_path: Path) -> None:
+    """Within a file, equal rows are readings of a coarse clock."""
+    log = write(tmp_path / "log.csv", HEADER + "".join(f"{n},1,1,20\n" for n in range(9)))
+    probe = ["0,20\n", "2,21\n", "2,21\n", "4,21\n", "6,22\n", "8,23\n"]
+    parts = ("".join(probe[:5]), "".join(probe[3:]), "6,30\n")
+    paths = [
+        write(tmp_path / f"{number}.csv", f"time [s],probe [degC]\n{rows}")
+        for number, rows in enumerate(parts)
+    ]
+    raw = read_log(log, channel=paths)
+    np.testing.assert_array_equal(raw["probe"], [20, 21, 21, 21, 22, 30, 23])
+    assert raw["time_probe"].dt.second.values.tolist() == [0, 2, 2, 4, 6, 6, 8]
+
+
 def test_unusable_channel_files_are_explained(tmp_path: Path) -> None:
     log = write(tmp_path / "log.csv", HEADER + "0,1,1,20\n1,1,1,20\n")
     doubled = write(tmp_path / "slow.csv", "time [s],temperature [degC]\n0,1\n1,1\n")

@@ -316,6 +316,16 @@ def test_gyro_axes_of_netcdf_are_on_a_shorter_dimension(tmp_path: Path, name: st
     assert raw.axis.values.tolist() == ["x"]
 
 
+@pytest.mark.parametrize("form", ["NETCDF4", "NETCDF3_CLASSIC"])  # strings, characters
+def test_text_of_netcdf_is_left_out_with_a_note(tmp_path: Path, form: Any) -> None:
+    rate = ("time", np.arange(50.0), {"units": "deg/h"})
+    pump = ("time", np.where(np.arange(50) < 20, "on", "off"))
+    log = xr.Dataset({"gyro_x": rate, "pump": pump})
+    log.to_netcdf(tmp_path / "a.nc", format=form)
+    notes = read_log(tmp_path / "a.nc", rate=10.0).attrs["notes"]
+    assert "a.nc: left out, as they hold text, not numbers: pump" in notes
+
+
 def test_masked_netcdf_cells_are_missing(tmp_path: Path) -> None:
     path = tmp_path / "packed.nc"
     since = {"units": "milliseconds since 2026-01-01", "_FillValue": -1}
@@ -378,6 +388,26 @@ def test_plain_hdf5_with_units_as_attributes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(raw.rate[0], [3600.0, 7200.0, 10800.0])
     assert raw.time.values[1] == np.datetime64(500, "ms")
     assert scan_file(path).format == "hdf5"
+
+
+def test_groups_of_hdf5_with_other_rates_are_channels(tmp_path: Path) -> None:
+    lengths = {"imu/gyro_x": 200, "acc/accel_x": 800, "env/temperature": 20, "odd/spare": 7}
+    units = ("deg/h", "g", "degC", "V")
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for (name, length), unit in zip(lengths.items(), units, strict=True):
+            file[name] = np.arange(float(length))
+            file[name].attrs["units"] = unit
+            if unit != "V":
+                clock = file.create_dataset(f"{name[:3]}/time", data=np.arange(length) * 8 / length)
+                clock.attrs["units"] = "s"
+    raw = read_log(tmp_path / "log.h5")
+    assert raw.rate.values.tolist() == [list(range(200))]
+    assert raw.sizes["time_accel_x"] == 800
+    second = np.timedelta64(1, "s")
+    seconds = (raw["time_temperature"].values - raw["time"].values[0]) / second
+    np.testing.assert_allclose(seconds, np.arange(20) * 0.4)
+    np.testing.assert_array_equal(raw["temperature"], np.arange(20))
+    assert any("left out" in note and "odd.spare" in note for note in raw.attrs["notes"])
 
 
 def test_hdf5_with_a_filter_of_netcdf_is_read(tmp_path: Path) -> None:

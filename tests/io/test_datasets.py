@@ -470,6 +470,7 @@ def test_provenance(files):
         assert file.source == "gyro log: bore_run_4a.csv, bore_run_4b.csv"
         assert json.loads(file.source_files) == ["bore_run_4a.csv", "bore_run_4b.csv"]
         assert file.title.startswith("Dynamic Allan variance")
+        assert {"title", "summary", "keywords", "Conventions"} <= set(file.ncattrs())  # ACDD 1.3
         assert file.window_samples == 1800
         assert {
             "date_created",
@@ -479,15 +480,14 @@ def test_provenance(files):
         } <= set(file.ncattrs())
 
 
-def test_a_product_of_a_stored_surface_has_its_own_title(tmp_path, files):
+def test_a_product_of_a_stored_surface_has_its_own_title_and_summary(tmp_path, files):
     product = synthetic.product().assign_attrs(open_surface(files["surface"]).attrs)
-    assert (
-        open_product(to_netcdf(product, tmp_path / "p.nc"))
-        .attrs["title"]
-        .endswith("Q, N, B, K and R of every window")
-    )
-    named = to_netcdf(product.assign_attrs(title="Run 7"), tmp_path / "n.nc")
-    assert open_product(named).attrs["title"] == "Run 7"
+    attrs = open_product(to_netcdf(product, tmp_path / "p.nc")).attrs
+    assert attrs["title"].endswith("Q, N, B, K and R of every window")
+    assert "five noise terms" in attrs["summary"]
+    given = {"title": "Run 7", "summary": "Oven test.", "keywords": "oven"}
+    named = open_product(to_netcdf(product.assign_attrs(given), tmp_path / "n.nc"))
+    assert given.items() <= named.attrs.items()
 
 
 def test_attributes_of_the_schema_reach_the_file(files):

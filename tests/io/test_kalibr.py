@@ -120,6 +120,17 @@ def test_worst_axis_may_be_one_with_a_limit_only(product, tmp_path):
     )
 
 
+def test_a_dead_axis_is_named(tmp_path):
+    log = make_accelerometers(samples=3_000)
+    log["rate"][0] = 3.3
+    log["accel_z"][:] = 1.0
+    product = gyrostab.fit_noise(gyrostab.davar(log, window="10s"))
+    text = to_kalibr(product, tmp_path / "imu.yaml", log=log).read_text()
+    for axis in ("gyroscope axis x", "accelerometer axis z"):
+        assert f"# {axis} is constant: its sensor is dead" in text
+    assert text.count("is constant") == 2
+
+
 def test_what_no_window_shows_is_null(product, tmp_path):
     product["observable"].loc[{"term": "K"}][:] = OBSERVABLE.index("not_observable")
     text = parse(to_kalibr(product, tmp_path / "imu.yaml"))

@@ -20,8 +20,8 @@ from tests.support import synthetic
 
 WRITERS = {"nc": to_netcdf, "zarr": to_zarr}
 ADDED = {
-    "Conventions", "date_created", "gyrostab_content", "gyrostab_version", "history", "references",
-    "source", "time_coverage_end", "time_coverage_start", "title",
+    "Conventions", "date_created", "gyrostab_content", "gyrostab_version", "history", "keywords",
+    "references", "source", "summary", "time_coverage_end", "time_coverage_start", "title",
 }  # fmt: skip
 
 

@@ -139,9 +139,11 @@ def test_every_run_has_a_name_also_where_a_folder_is_called_files(tmp_path):
         (["x/log.csv", "x/LOG.txt"], "file", {"x/log.csv", "x/LOG.txt"}),
         (["run/1.nc", "RUN/2.nc"], "folder", {"run", "RUN_"}),
         (["Index.HTML/1.nc", "r/2.nc"], "folder", {"Index.HTML/files", "r"}),
+        (["AUX/nul.csv", "AUX/falcon.csv"], "file", {"AUX_/nul_", "AUX_/falcon"}),
+        (["Com1.a/con.csv", "Com1.a/con.txt"], "file", {"Com1_.a/con_.csv", "Com1_.a/con_.txt"}),
     ],
 )
-def test_names_of_runs_differ_by_more_than_case(tmp_path, names, per, expected):
+def test_names_of_runs_are_those_of_different_files_on_any_system(tmp_path, names, per, expected):
     files = [tmp_path / name for name in names]
     table = pd.DataFrame({"file": map(str, files), "bytes": 0, "is_log": True, "note": ""})
     runs = find_runs(Archive(tmp_path, files, []), table, per=per)

@@ -187,6 +187,14 @@ def test_unusual_axis_names_and_single_windows_are_drawn(tmp_path):
     ]
 
 
+def test_each_axis_has_its_own_figures(monkeypatch, tmp_path):
+    figures = dict.fromkeys(["adev_a/b", "adev_a_b", "adev_A?B"], Figure)
+    monkeypatch.setattr("gyrostab.plot.figures.product_figures", lambda product, width: figures)
+    saved = [path.name for path in save_figures(synthetic.product(), tmp_path, dpi=20)]
+    assert saved == ["adev_a_b.png", "adev_a_b_.png", "adev_A_B__.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(saved)
+
+
 def test_wrong_input_and_existing_figures_are_refused(tmp_path):
     with pytest.raises(SchemaError, match="no variable"):
         save_figures(synthetic.surface(), tmp_path)

@@ -219,8 +219,16 @@ def is_number(text: str, *, comma: bool = False) -> bool:
 
 
 def plain_number(text: str) -> str:
-    """Write the exponent of a number with E, where Fortran writes D, and minus as a hyphen."""
-    return text.upper().replace("D", "E").replace("\N{MINUS SIGN}", "-")
+    """Write the exponent of a number with E, where Fortran writes D, and minus as a hyphen.
+
+    Examples
+    --------
+    >>> [plain_number(text) for text in ("1.5d+02", "\N{MINUS SIGN}1.5", "(1.5)")]
+    ['1.5E+02', '-1.5', '-1.5']
+    """
+    text = text.upper().replace("D", "E").replace("\N{MINUS SIGN}", "-")
+    in_brackets = text.startswith("(") and text.endswith(")")  # of spreadsheets
+    return f"-{text[1:-1]}" if in_brackets else text
 
 
 def cells_to_ns(

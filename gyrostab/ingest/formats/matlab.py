@@ -34,6 +34,7 @@ from gyrostab.ingest.columns.headers import (
     KNOWN_CHANNEL_PATTERN,
     TIME_PATTERN,
     is_time_unit,
+    split_header,
     time_suffix,
 )
 from gyrostab.ingest.columns.plan import describe_left_out
@@ -76,14 +77,13 @@ def matches(path: Path) -> bool:
 
 
 @contextmanager
-def _open_table(path: Path, options: ReadOptions) -> Iterator[TablesOfFile]:
-    """Return the table of the longest variables."""
+def _open_tables(path: Path, options: ReadOptions) -> Iterator[TablesOfFile]:
     with ExitStack() as stack:
-        yield _make_table(path, options, stack)
+        yield _make_tables(path, options, stack)
 
 
-_scan_matlab, read = make_reader("matlab", _open_table)
-_scan_hdf5, _ = make_reader("hdf5", _open_table)
+_scan_matlab, read = make_reader("matlab", _open_tables)
+_scan_hdf5, _ = make_reader("hdf5", _open_tables)
 
 
 def scan(path: Path, options: ReadOptions) -> FileSummary:
@@ -92,7 +92,11 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     return (_scan_hdf5 if is_hdf5 else _scan_matlab)(path, options)
 
 
-def _make_table(path: Path, options: ReadOptions, stack: ExitStack) -> TablesOfFile:
+def _make_tables(path: Path, options: ReadOptions, stack: ExitStack) -> TablesOfFile:
+    """Return a table of the variables as long as the gyro axes, and those of others with a time.
+
+    Without known gyro axes, the first table has the longest variables.
+    """
     objects: list[str] = []
     sized_columns = [
         (max(array.shape), column)
@@ -111,18 +115,61 @@ def _make_table(path: Path, options: ReadOptions, stack: ExitStack) -> TablesOfF
         raise FormatError(
             f"{path.name}: there is no vector or matrix of numbers in it; save plain arrays"
         )
-    rows = int(max(size for size, _ in sized_columns))
-    columns = [column for size, column in sized_columns if size == rows]
-    shorter = [column.name[0] for size, column in sized_columns if size != rows]
-    notes = describe_left_out(f"they are shorter than the {rows} rows of the longest", shorter)
+    by_rows: dict[int, list[TableColumn]] = {}
+    for size, column in sized_columns:
+        by_rows.setdefault(int(size), []).append(column)
+    rows = max(by_rows, key=lambda size: (_holds_axes(by_rows[size], options), size))
+    columns = by_rows.pop(rows)
+    has_clock = _find_clock(columns) is not None
+    tables = [Table(rows, _name_fields(columns))]
+    left_out: list[str] = []
+    for size, columns in by_rows.items():
+        clock = _find_clock(columns) if has_clock else None
+        if clock is None:
+            left_out += [column.name[0] for column in columns]
+            continue
+        stamps = replace(columns.pop(clock), name=("",))
+        named = [column.target for table in tables for column in table.columns]
+        tables.append(Table(size, _name_fields(columns, named), stamps))
+    notes = describe_left_out(
+        f"they do not have the {rows} rows of the others, nor a time with a unit", left_out
+    )
     if objects:
         notes.append(
             f"left out, as MATLAB alone can read it: {', '.join(dict.fromkeys(objects))}; to "
             f"keep it, {_PLAIN_ARRAYS}"
         )
+    return tables, notes
+
+
+def _holds_axes(columns: Sequence[TableColumn], options: ReadOptions) -> bool:
+    """Return whether a column is a gyro axis by its name, as a field, or by ``--map``."""
+    mapped = {key.strip().lower(): target for key, target in options.map.items()}
+    names = [mapped.get(c.name[0].lower()) or c.target or c.name[0] for c in _name_fields(columns)]
+    return any(AXIS_PATTERN.match(split_header(name)[0].lower()) for name in names)
+
+
+def _find_clock(columns: Sequence[TableColumn]) -> int | None:
+    """Return the only column with name and unit of a time."""
+    clocks = [
+        place
+        for place, column in enumerate(columns)
+        if TIME_PATTERN.match(column.name[0].rpartition(".")[2].lower())
+        and is_time_unit(column.unit or "")
+    ]
+    return clocks[0] if len(clocks) == 1 else None
+
+
+def _name_fields(
+    columns: Sequence[TableColumn], named: Sequence[str | None] = ()
+) -> list[TableColumn]:
+    """Give fields their known names, except for those that others have."""
     fields = _known_fields([column.name[0] for column in columns])
-    columns = [replace(c, target=fields.get(place)) for place, c in enumerate(columns)]
-    return [Table(rows, columns)], notes
+    targets = [fields.get(place) for place in range(len(columns))]
+    return [
+        replace(column, target=None if target in named else target)
+        for column, target in zip(columns, targets, strict=True)
+    ]
 
 
 def _known_fields(headers: Sequence[str]) -> dict[int, str]:

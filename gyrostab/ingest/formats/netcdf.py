@@ -121,7 +121,11 @@ def _find_tables(path: Path, stored: xr.Dataset, options: ReadOptions) -> Tables
         else:
             columns[dim] += variable_columns
         left_out += [] if variable_columns else [name]
-    notes = describe_left_out(f"they do not run along {main_dim!r} alone", left_out)
+    texts = [n for n, v in variables.items() if v.dtype.kind in "OSUT" and main_dim in v.dims]
+    notes = [
+        *describe_left_out(f"they do not run along {main_dim!r} alone", left_out),
+        *describe_left_out("they hold text, not numbers", texts),
+    ]
     return [Table(sizes[dim], part, clocks.get(dim)) for dim, part in columns.items()], notes
 
 

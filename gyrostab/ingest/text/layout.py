@@ -29,6 +29,8 @@ MAX_LINES = 2 * HEAD_LINES + 20
 #: with another word than the row before: random words of two kinds have half.
 _MIN_RECURRENCES, _MIN_CHANGING_SHARE = 4, 0.75
 
+#: Last names of headers whose rows may end before: a separator at the end, comments of LabVIEW.
+_OPTIONAL_NAMES = ("", "comment")
 _HEADER_CELLS = re.compile(r"(?:[^\s\[]+(?:\[[^\[\]]*\])?(?:[ \t]+\[[^\[\]]*\])?)")
 _DURATION = re.compile(r"^\s*[+-]?\d+(?:\.\d+)? (ms|s|sec|min|h|hr|d|day|days)\s*$")
 _COMMENT = re.compile(r"^\s*[#%]")
@@ -188,6 +190,8 @@ def find_layout(
     headers = list(header) if header is not None else [str(column) for column in range(width)]
     if width == len(headers) + 1 and all(row[-1] == "" for row in rows if len(row) == width):
         headers.append("")  # every data row ends with a separator
+    if width == len(headers) - 1 and headers[-1].lower() in _OPTIONAL_NAMES:
+        headers.pop()
     if separator == "," and width == len(headers) + 1:
         _check_seconds(path, rows[0], first + 1)
     if separator == BLANK and width != len(headers):
@@ -378,15 +382,20 @@ def _find_header(
     path: Path, lines: list[str], content: list[int]
 ) -> tuple[list[str] | None, str, int, int]:
     """Find header cells (or None), separator, and indices of header and first data line."""
+    guessed = [(_guess_separator(lines[index]), lines[index]) for index in content]
+    rows_of_data = (
+        place
+        for place, (mark, line) in enumerate(guessed)
+        if _is_data(split_line(line, mark), comma=mark in COMMA_SEPARATORS)
+    )
+    first_row = next(rows_of_data, -1)
     for place, index in enumerate(content[:HEAD_LINES]):
-        separator = _guess_separator(lines[index])
-        cells = split_line(lines[index], separator)
-        if _is_data(cells, comma=separator in COMMA_SEPARATORS):
-            return _commented_header(lines, index, separator, len(cells)), separator, index, index
-        names = _header_cells(lines[index], separator)
-        following = [
-            (_guess_separator(lines[i]), lines[i]) for i in content[place + 1 : place + 21]
-        ]
+        separator, line = guessed[place]
+        if place == first_row:
+            width = len(split_line(line, separator))
+            return _commented_header(lines, index, separator, width), separator, index, index
+        names = _header_cells(line, separator)
+        following = guessed[place + 1 : max(place, first_row) + 21]
         rows = [(mark, _split_data(line, mark, len(names))) for mark, line in following]
         solid = [(mark, row) for mark, row in rows if _is_data(row, comma=mark in COMMA_SEPARATORS)]
         widths = {len(row) for mark, row in solid or rows if mark == separator}
@@ -394,6 +403,8 @@ def _find_header(
             continue  # a line above the header, padded to the width of the table
         if _find_pair([row for _, row in solid]) is not None:
             widths |= {width - 1 for width in widths}  # one name for date and time of day
+        if separator != BLANK and place + 1 == first_row and names[-1].lower() in _OPTIONAL_NAMES:
+            widths |= {width + 1 for width in widths}
         if (
             not following
             or len(names) in widths

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import glob
+import hashlib
 import os
 import re
 import secrets
@@ -89,7 +90,7 @@ def new_output(
             "then delete it",
             stacklevel=3,
         )
-    hidden = target.with_name(_hide_name(target.name))
+    hidden = target.with_name(hide_name(target.name, _make_mark()))
     with _temporary_output(target, hidden, make_folder=find_foreign is not None) as temporary:
         yield temporary
         _sync_tree(temporary)
@@ -111,9 +112,8 @@ def replace_file(path: Path) -> Iterator[Path]:
         with upload_file(path) as temporary:
             yield temporary
         return
-    with _temporary_output(
-        path, path.with_name(_hide_name(path.name)), make_folder=False
-    ) as temporary:
+    hidden = path.with_name(hide_name(path.name, _make_mark()))
+    with _temporary_output(path, hidden, make_folder=False) as temporary:
         yield temporary
         _sync_tree(temporary)
         os.replace(temporary, path)
@@ -161,7 +161,7 @@ def new_folder(folder: str | os.PathLike[str], *, overwrite: bool = False) -> It
     folder = Path(folder)
     made = _make_folder(folder)
     try:
-        with _temporary_output(folder, folder / _hide_name(""), make_folder=True) as temporary:
+        with _temporary_output(folder, folder / _make_mark(), make_folder=True) as temporary:
             yield temporary
             _sync_tree(temporary)
             check_unchanged()
@@ -219,12 +219,23 @@ def _temporary_output(target: Path, temporary: Path, *, make_folder: bool) -> It
             _remove_until_gone(temporary)
 
 
-def _hide_name(name: str) -> str:
-    """Make a unique hidden name for a file or folder that is being written."""
-    mark = f".gyrostab-{secrets.token_hex(4)}.part"
-    return (
-        f".{name}{mark}" if name and len(os.fsencode(f".{name}{mark}")) <= _MAX_NAME_BYTES else mark
-    )
+def hide_name(name: str, suffix: str) -> str:
+    """Make the hidden name of a file or folder for an output, shorter where the name is too long.
+
+    Examples
+    --------
+    >>> hide_name("log.nc", ".job"), hide_name("n" * 255, ".job")
+    ('.log.nc.job', '.3bb555e4.job')
+    """
+    hidden = f".{name}{suffix}"
+    if len(os.fsencode(hidden)) <= _MAX_NAME_BYTES:
+        return hidden
+    return f".{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}{suffix}"
+
+
+def _make_mark() -> str:
+    """Make a unique suffix for a file or folder that is being written."""
+    return f".gyrostab-{secrets.token_hex(4)}.part"
 
 
 def is_leftover(name: str) -> bool:
@@ -239,7 +250,9 @@ def is_leftover(name: str) -> bool:
 
 
 def _find_leftovers(target: Path) -> list[Path]:
-    names = glob.glob(f".{glob.escape(target.name)}.gyrostab-????????.part", root_dir=target.parent)
+    mark = f".gyrostab-{8 * '?'}.part"
+    hidden = hide_name(target.name, mark).removesuffix(mark)
+    names = glob.glob(glob.escape(hidden) + mark, root_dir=target.parent)
     return [target.parent / name for name in sorted(names) if is_leftover(name)]
 
 
@@ -262,7 +275,7 @@ def _replace_folder(temporary: Path, target: Path, find_foreign: FindForeign) ->
                 "give another name with -o"
             )
     else:
-        aside = target.with_name(_hide_name(target.name))
+        aside = target.with_name(hide_name(target.name, _make_mark()))
         target.rename(aside)
         try:
             temporary.rename(target)

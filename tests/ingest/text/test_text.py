@@ -364,6 +364,33 @@ def test_lines_above_the_header_may_be_padded_to_its_width(tmp_path: Path) -> No
     assert any("skipped 2 lines above the header" in note for note in raw.attrs["notes"])
 
 
+LABVIEW = "LabVIEW Measurement\t\nWriter_Version\t2\nReader_Version\t2\nSeparator\tTab\n" + (
+    "Decimal_Separator\t,\nMulti_Headings\tNo\nX_Columns\tOne\nTime_Pref\tRelative\nOperator\tK\n"
+    "Date\t2026/05/01\nTime\t08:00:00,5\n***End_of_Header***\t\n\t\nChannels\t2\t\t\n"
+    "Samples\t3\t3\t\nDate\t2026/05/01\t2026/05/01\t\nTime\t08:00:00,5\t08:00:00,5\t\n"
+    "Y_Unit_Label\tdeg/h\tdeg/h\t\nX_Dimension\tTime\tTime\t\nX0\t0,0E+0\t0,0E+0\t\n"
+    "Delta_X\t0,100000\t0,100000\t\n***End_of_Header***\t\t\t\nX_Value\tgyro_x\tgyro_y\tComment\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("above", "rows", "line"),
+    [
+        ("key,value\n" * 30 + "X_Value,gyro_x,gyro_y\n", "{},{},-2.5\n", 32),
+        ("title: a b\n" * 150 + "X_Value,gyro_x,gyro_y,\n", "{},{},-2.5\n", 152),
+        (LABVIEW, "{}\t{}\t-2,5\n", 24),
+        (LABVIEW, "{}\t{}\t-2,5\t\n", 24),
+    ],
+)
+def test_a_header_may_be_below_many_lines_and_longer_than_its_rows(
+    tmp_path: Path, above: str, rows: str, line: int
+) -> None:
+    path = write(tmp_path, above + "".join(rows.format(row, 3 * row) for row in range(40)))
+    raw = read_log(path, map={"X_Value": "time"}, unit={"time": "s", "gyro": "deg/h"})
+    assert find_layout(path, path.read_bytes(), complete=True).line == line
+    np.testing.assert_array_equal(raw["rate"], [range(0, 120, 3), [-2.5] * 40])
+
+
 @pytest.mark.parametrize(
     ("labels", "is_noted"), [("AB", True), ("ABC", True), ("AAAABBBB", False), ("A", False)]
 )
@@ -468,6 +495,17 @@ def test_minus_signs_of_typography_are_read(tmp_path: Path, ending: str) -> None
     np.testing.assert_array_equal(raw.time, plain.time)
     assert len(raw.attrs["notes"]) == 1
     assert scan_file(path).first == plain.time[0]
+
+
+def test_negative_numbers_of_spreadsheets_are_in_parentheses(tmp_path: Path) -> None:
+    rows = "".join(
+        f"{n};" + (f"{x},25" if x >= 0 else f"({-x},25)") + "\n"
+        for n, x in enumerate(range(-12, 12))
+    )
+    raw = read_log(write(tmp_path, "time [s];gyro_x [deg/h]\n" + rows))
+    expected = [x + (0.25 if x >= 0 else -0.25) for x in range(-12, 12)]
+    assert raw.rate.values.tolist() == [expected]
+    assert not any("unreadable" in note for note in raw.attrs["notes"])
 
 
 def test_exponents_of_fortran_are_read(tmp_path: Path) -> None:

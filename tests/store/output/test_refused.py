@@ -396,12 +396,15 @@ def test_an_input_that_changes_before_the_output_is_complete(folder, change, mon
     assert not [name for name in os.listdir(folder) if "new.nc" in name]
 
 
-def test_a_leftover_of_a_killed_process_is_reported(tmp_path):
-    left = tmp_path / ".log.nc.gyrostab-0123abcd.part"
-    left.write_text("half")
+@pytest.mark.parametrize("name", ["log.nc", "[n]" * 84 + ".nc"])
+def test_a_leftover_of_a_killed_process_is_reported(name, tmp_path):
+    with new_output(tmp_path / name) as temporary:
+        left = temporary.name[:-13] + "0123abcd.part"
+    (tmp_path / left).write_text("half")
+    log = make_log(np.zeros((1, 10)), rate=1.0, unit="deg/h")
     with pytest.warns(UserWarning, match="killed: then delete it"):
-        to_netcdf(make_log(np.zeros((1, 10)), rate=1.0, unit="deg/h"), tmp_path / "log.nc")
-    assert left.read_text() == "half"
+        to_netcdf(log, tmp_path / name, overwrite=True)
+    assert (tmp_path / left).read_text() == "half"
 
 
 def test_long_names_and_names_without_a_name(tmp_path, monkeypatch):
