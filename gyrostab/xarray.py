@@ -19,10 +19,11 @@ from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
 import gyrostab
-from gyrostab.arrays import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from gyrostab.arrays import Array
 
 
 @xr.register_dataset_accessor("gyro")  # type: ignore[no-untyped-call]
