@@ -413,9 +413,14 @@ def split_steps(
 
     Steps of different axes are one if hardly any block lies between their times. The grid of times
     of each step ends half way to the others of its axis: at their times it could not be
-    distinguished from them.
+    distinguished from them. Two steps of an axis at one time are one.
     """
-    steps = [step for component in components for step in _single_steps(component)]
+    by_place: dict[tuple[object, float], Component] = {}
+    for step in (step for component in components for step in _single_steps(component)):
+        other = by_place.setdefault((step.row, step.step_time), step)
+        if step.evidence_nats > other.evidence_nats:
+            by_place[step.row, step.step_time] = step
+    steps = list(by_place.values())
     groups = _group_steps(steps, state)
     if len(groups) < 2:
         return [([*steps, *(part for part in components if not part.is_step)], state)]

@@ -146,6 +146,22 @@ def test_steps_of_other_axes_do_not_limit_the_times_of_a_step() -> None:
         assert all(step.candidate.variants for step in part)
 
 
+def test_steps_of_one_axis_at_one_time_are_one() -> None:
+    """Jumps that were selected one after another may be set to the same time."""
+    second = np.arange(9_000) / 5.0
+    rate = np.random.default_rng(1).standard_normal((1, second.size))
+    blocks = reduce_log(make_log(rate, rate=5.0, unit="deg/h"))
+    jumps, state = try_jumps(blocks, baseline_from_model(blocks, MODEL))
+    early, late = (jumps.variants[place] for place in (20, 60))
+    steps = [
+        Component(jumps, variant, ("x",), nats)
+        for variant, nats in ((late, 9.0), (early, 20.0), (late, 7.0))
+    ]
+    parts = split_steps(steps, state)
+    assert [[step.evidence_nats for step in part] for part, _ in parts] == [[20.0], [9.0]]
+    assert all(step.candidate.variants for part, _ in parts for step in part)
+
+
 def test_jump_at_a_restart_may_settle() -> None:
     """Its cause is known there, and what follows a start is often slow."""
     second = np.arange(18_000) / 10.0
