@@ -76,9 +76,8 @@ def layer_weights(layers: int, *, trim: float = 0.0, scatter: Floats | None = No
     side = np.where(np.isin(np.arange(layers) % 4, (0, 3)), 1.0, -1.0)
     weights = np.zeros(layers)
     for sign in (1.0, -1.0):
-        mine = np.flatnonzero(side == sign)[
-            ::-1
-        ]  # from the spool, where the middle of the fiber is
+        # from the spool, where the middle of the fiber is, outwards
+        mine = np.flatnonzero(side == sign)[::-1]
         ends = np.cumsum(lengths[mine])
         begins = ends - lengths[mine]
         weights[mine] = sign * (

@@ -27,8 +27,8 @@ _NORMAL /= _NORMAL.std()
 _MAX_MEANS = 200  # of blocks, or of equal groups of blocks with similar means; limits time
 _TRANSFER_ROUNDS = 100  # of a fixed-point iteration; limits time
 _MIN_SHARE = 1e-3  # of a variance that is left; a power of zero has no likelihood
-#: Largest scatter that random gaps may give all bands of a block together, over that of the
-#: steadiest band; the rest is that of the band alone. Design choice.
+#: Largest scatter that random gaps may give all bands of a block together, divided by that
+#: of the steadiest band; the rest is that of the band alone. Design choice.
 _MAX_GAP_SCATTER_SHARE = 0.8
 
 
