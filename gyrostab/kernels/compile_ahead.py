@@ -24,7 +24,8 @@ _running: list[subprocess.Popen[bytes]] = []
 def start_compilation(module: str, kernel: Any) -> None:
     """Run a module that compiles kernels in another process, unless the cache has `kernel`.
 
-    Nothing is started on a single processor core, or where numba has no cache to write to.
+    Nothing is started on a single processor core, where numba has no cache to write to, or while
+    such a process runs.
 
     Parameters
     ----------
@@ -35,7 +36,7 @@ def start_compilation(module: str, kernel: Any) -> None:
     """
     stats = getattr(kernel, "stats", None)  # absent where numba is switched off
     folder = stats and stats.cache_path
-    if not folder or (os.cpu_count() or 1) < 2:
+    if not folder or (os.cpu_count() or 1) < 2 or any(other.poll() is None for other in _running):
         return
     line = kernel.py_func.__code__.co_firstlineno  # files of an earlier source have another
     version = f"py{sys.version_info[0]}{sys.version_info[1]}"

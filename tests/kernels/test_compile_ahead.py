@@ -74,6 +74,21 @@ def test_another_kernel_in_the_cache_does_not_count(module: Path, tmp_path: Path
     assert module.exists()
 
 
+def test_one_process_runs_at_a_time(
+    module: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running: list[object] = []
+    monkeypatch.setattr(compile_ahead, "_running", running)
+    for _ in range(2):
+        start_compilation("slow_module", kernel_with_cache(tmp_path))
+    assert len(running) == 1
+    await_compilation()
+    start_compilation("slow_module", kernel_with_cache(tmp_path))
+    assert len(running) == 2
+    await_compilation()
+    assert module.exists()
+
+
 def test_a_process_that_fails_is_ignored(module: Path, tmp_path: Path) -> None:
     start_compilation("no_such_module", kernel_with_cache(tmp_path))
     await_compilation()
