@@ -209,14 +209,24 @@ def identify_switching(
 ) -> list[str]:
     """Return the keys of biases that switch within blocks and have no possible cause.
 
-    An axis has one of them: with it in the model, more switching does not explain powers and tails
-    that the first has left, and may be a jump.
+    No other effect in the means of the same axis explains more. An axis has one of them: with it in
+    the model, more switching does not explain powers and tails that the first has left, and may be
+    a jump.
     """
+    strongest: dict[tuple[str, ...], float] = {}
+    for key in passing:
+        for component in components[key]:
+            if component.statistic.is_linear_in_means and not is_nuisance(key):
+                best = strongest.get(component.row, 0.0)
+                strongest[component.row] = max(best, component.evidence_nats)
     return [
         key
         for key in drop_switching_with_a_cause(passing, components, state)
-        if any(
-            component.variant.inside.size and not state.given.get(("sub_block", component.row[0]))
+        if not is_nuisance(key)
+        and any(
+            component.variant.inside.size
+            and not state.given.get(("sub_block", component.row[0]))
+            and component.evidence_nats > strongest.get(component.row, 0.0)
             for component in components[key]
         )
     ]

@@ -20,6 +20,7 @@ _TRANSITION_BLOCKS = (4, 8)  # lengths of the gradual changes that a jump is com
 EVENT_LENGTHS = 48  # that are tried, from two blocks up
 MIN_EVENT_LIMIT_BLOCKS = 8.0
 MIN_LEVEL_BLOCKS = 3  # before and after an event, that determine the level there
+_SHIFTS = 40  # of all restarts; limits time
 _VARIANCE_FACTORS = (10.0, 100.0, 1e3, 1e4, 1e5)  # relative to white and angle noise of a mean
 
 
@@ -88,10 +89,12 @@ def scatter_competitors(component: Component, state: State) -> Iterator[Competit
 
 
 def restart_competitors(component: Component, state: State) -> Iterator[Competitor]:
-    """Yield the gradual change that competes with jumps at every restart on an axis.
+    """Yield what competes with jumps at every restart on an axis.
 
-    Its parts are straight changes about each restart, up to the middle between two of them. As many
-    free sizes follow any slow course, such as motion of the tool.
+    As many free sizes follow any slow course, such as motion of the tool. The parts of a gradual
+    change are straight, about each restart up to the middle between two of them. As many jumps at
+    other instants are those at the restarts, all shifted round the record by the same time; the
+    restarts must explain more than all but the usual share of them.
     """
     if component.candidate.effect != _JUMP or len(component.variant.columns) < 2:
         return
@@ -105,6 +108,20 @@ def restart_competitors(component: Component, state: State) -> Iterator[Competit
     settings = state.settings
     allowed = settings.ambiguous_nats + settings.form_error_share * component.evidence_nats
     yield Competitor("a gradual change", gradual - steps, allowed)
+    shifts = np.unique(np.linspace(0, block_count, _SHIFTS + 1, endpoint=False).astype(int))[1:]
+    changes = np.diff(component.variant.design[:, 0], prepend=0.0)
+    elsewhere = [
+        component_mixture(
+            component,
+            state,
+            _with_course(component, *np.roll(changes, shift, axis=1).cumsum(axis=1)),
+        ).evidence
+        for shift in shifts
+    ]
+    counted = int(settings.surrogate_share * (1 + shifts.size))
+    if counted:
+        strongest = float(np.sort(elsewhere)[-counted])
+        yield Competitor("jumps at other instants", strongest - steps, 0.0)
 
 
 def _sum_evidence(jumps: Sequence[Component], state: State, courses: Sequence[Floats]) -> float:
