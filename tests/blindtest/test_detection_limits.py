@@ -24,7 +24,7 @@ from gyrostab.blindtest.generator.detection_limits import (
 from gyrostab.blindtest.generator.noise import BANDS
 from gyrostab.blindtest.generator.scenario import AXES, draw_scenario, stream
 from gyrostab.blindtest.generator.shapes import fit_lagged_driver
-from gyrostab.blindtest.generator.wander import wander_size
+from gyrostab.blindtest.generator.wander import course_nats, wander_size
 from tests.support.blind_cases import white_scenario
 
 
@@ -143,6 +143,49 @@ def test_fitted_noise_absorbs_random_walk_and_not_a_fast_random_bias():
         )
     fast, slow = shares_left
     assert 0.0 < slow < 0.1 < fast < 1.0
+
+
+def draw_course(rng: np.random.Generator, size: int, dwell: np.ndarray) -> np.ndarray:
+    level = np.empty(size)
+    level[0] = rng.random() < dwell[1] / dwell.sum()
+    leave = -np.expm1(-1.0 / dwell)
+    for at in range(1, size):
+        switches = rng.random() < leave[int(level[at - 1])]
+        level[at] = 1 - level[at - 1] if switches else level[at - 1]
+    return level
+
+
+def test_a_course_of_independent_levels_costs_what_a_binary_channel_tells():
+    """Mutual information of a fair bit and a normal reading of it, for every second."""
+    scenario, dwell = white_scenario(), np.full(2, 1.0 / math.log(2.0))
+    course = draw_course(np.random.default_rng(1), scenario.temperature.size, dwell)
+    step = 0.3  # deg/h between the levels; a mean over a second scatters by 60 N
+    information = (step / (60 * 0.004)) ** 2
+    odds = np.linspace(-12, 12, 4001) * math.sqrt(information) + information / 2
+    density = np.exp(-((odds - information / 2) ** 2) / 2 / information)
+    density /= density.sum()
+    bit = math.log(2.0) - float(density @ np.log1p(np.exp(-odds)))
+    cost = course_nats(
+        scenario, np.array([0.0, step, 0.0]), course, dwell, np.random.default_rng(2)
+    )
+    assert cost == pytest.approx(bit * course.size, rel=0.05)
+
+
+def test_a_course_that_is_seen_clearly_costs_its_own_surprise():
+    scenario, dwell = white_scenario(), np.array([40.0, 90.0])
+    course = draw_course(np.random.default_rng(3), scenario.temperature.size, dwell)
+    leave = -np.expm1(-1.0 / dwell)
+    before, after = course[:-1].astype(int), course[1:].astype(int)
+    chance = np.where(before == after, 1.0 - leave[before], leave[before])
+    start = dwell[int(course[0])] / dwell.sum()
+    surprise = -float(np.log(chance).sum()) - math.log(start)
+    rng = np.random.default_rng(4)
+    clear, hidden = (
+        course_nats(scenario, np.array([size, 0.0, size]), course, dwell, rng)
+        for size in (30.0, 1e-4)
+    )
+    assert clear == pytest.approx(surprise, abs=0.05)  # the first level is drawn by mean times
+    assert hidden == pytest.approx(0.0, abs=0.05)
 
 
 def test_the_turn_that_a_misaligned_axis_sees_is_no_evidence_in_fitted_noise():

@@ -9,10 +9,23 @@ import numpy as np
 from scipy.signal import lfilter
 
 from gyrostab.arrays import Floats
-from gyrostab.blindtest.generator.detection_limits import NATS, amplitude_for, learned_random_nats
+from gyrostab.blindtest.generator.detection_limits import (
+    NATS,
+    amplitude_for,
+    learned_nats,
+    learned_random_nats,
+)
 from gyrostab.blindtest.generator.noise import floor_psd
-from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
+from gyrostab.blindtest.generator.scenario import (
+    AXES,
+    Effect,
+    Scenario,
+    count_per_second,
+    to_samples,
+)
 from gyrostab.blindtest.generator.shapes import axes_with_share, draw_shares, make_mean_effect
+
+_COST_DRAWS = 8  # of the noise, in the mean cost of a course; limits time
 
 
 def wander_size(
@@ -50,29 +63,72 @@ def _make_random_bias(
     *,
     strength: float,
     time: float,
-    normal: bool,
+    dwell: Floats | None = None,
     **description: Any,
 ) -> Effect:
-    """Make a random bias; one of a normal law shows in its spectrum only."""
+    """Make a random bias: one of a normal law, or one of two levels with mean times `dwell` [s]."""
     shares = draw_shares(rng)
     rms = amplitude_for(
         lambda a: wander_size(scenario, shares, time=time, rms=a)[0], strength, first=1e-4
     )
     size, nats = wander_size(scenario, shares, time=time, rms=rms)
+    mean = shares[:, None] * rms * to_samples(scenario, waveform)[None, :]
+    learned = None
+    if scenario.measured is None:
+        learned = learned_random_nats(
+            scenario, shares, lambda f: rms**2 * _lorentz_density(f, time)
+        )
+        if dwell is not None:
+            cost = course_nats(scenario, rms * shares, waveform, dwell, rng.spawn(1)[0])
+            learned = max(learned, learned_nats(scenario, mean) - cost)
     return Effect(
         axes=axes_with_share(shares),
         size=size,
         nats=nats,
-        learned_nats=learned_random_nats(
-            scenario, shares, lambda f: rms**2 * _lorentz_density(f, time)
-        )
-        if normal and scenario.measured is None
-        else None,
+        learned_nats=learned,
         tau=(max(1.0, 0.2 * time), scenario.seconds / 3),
-        mean=shares[:, None] * rms * to_samples(scenario, waveform)[None, :],
+        mean=mean,
         parameters={"correlation_time": {"value": time, "unit": "s"}},
         **description,
     )
+
+
+def course_nats(
+    scenario: Scenario,
+    amplitude: Floats,
+    waveform: Floats,
+    dwell: Floats,
+    rng: np.random.Generator,
+) -> float:
+    """Estimate the evidence that an unknown course of two levels costs [nats].
+
+    It is the mutual information of the course and the record: how much more likely the record is
+    with the course known than with only its law known, in the mean over the noise. The law is that
+    of random switching with mean times `dwell` (2,) [s] on the lower and on the upper level. Only
+    white noise counts, of means over seconds. `amplitude` (axis,) [deg/h] multiplies the `waveform`
+    (second,).
+    """
+    is_upper = waveform > waveform.mean()
+    step = amplitude * np.ptp(waveform)
+    density = np.array(
+        [
+            floor_psd(np.ones(1), noise={"N": noise["N"]}, rate=scenario.rate)[0]
+            for noise in scenario.noise
+        ]
+    )
+    # the log odds of the upper level by the record of a second are normal, with this variance
+    information = float((step**2 / density).sum()) * count_per_second(scenario) / scenario.rate
+    odds = (is_upper - 0.5) * information + np.sqrt(information) * rng.standard_normal(
+        (_COST_DRAWS, is_upper.size)
+    )
+    rises, falls = -np.expm1(-1.0 / dwell)
+    upper, log_evidence = np.full(_COST_DRAWS, dwell[1] / dwell.sum()), np.zeros(_COST_DRAWS)
+    for log_odds in odds.T:
+        upper = upper * (1.0 - falls) + (1.0 - upper) * rises
+        raised = np.logaddexp(np.log1p(-upper), np.log(upper) + log_odds)
+        log_evidence += raised
+        upper = np.exp(np.log(upper) + log_odds - raised)
+    return float((odds @ is_upper - log_evidence).mean())
 
 
 def _draw_correlation_time(scenario: Scenario, rng: np.random.Generator) -> float:
@@ -98,7 +154,6 @@ def gauss_markov(scenario: Scenario, rng: np.random.Generator, *, strength: floa
         time=time,
         form=form,
         form_differs=heavy,
-        normal=True,
     )
 
 
@@ -123,7 +178,7 @@ def telegraph(scenario: Scenario, rng: np.random.Generator, *, strength: float) 
         time=time,
         form=form,
         form_differs=gamma,
-        normal=False,
+        dwell=dwell,
     )
 
 
