@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gyrostab.arrays import Floats
+from gyrostab.arrays import Floats, Ints
 from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State
@@ -92,36 +92,48 @@ def restart_competitors(component: Component, state: State) -> Iterator[Competit
     """Yield what competes with jumps at every restart on an axis.
 
     As many free sizes follow any slow course, such as motion of the tool. The parts of a gradual
-    change are straight, about each restart up to the middle between two of them. As many jumps at
-    other instants are those at the restarts, all shifted round the record by the same time; the
-    restarts must explain more than all but the usual share of them.
+    change are straight, about each restart up to the middle between two of them.
+
+    As many jumps at other instants are those at the restarts, all shifted round the record by the
+    same time. The restarts must explain more than all but the usual share of them. Shifts by which
+    most restarts meet others do not count: restarts at equal intervals repeat themselves.
     """
     if component.candidate.effect != _JUMP or len(component.variant.columns) < 2:
         return
-    block, block_count = float(state.blocks.attrs["block_s"]), state.blocks.sizes["block"]
-    restarts = block * (1.0 - component.variant.design[:, 0]).sum(axis=1)
-    edges = np.concatenate([[0.0], (restarts[1:] + restarts[:-1]) / 2.0, [block_count * block]])
-    time = (np.arange(block_count) + 0.5) * block
-    courses = np.clip((time - edges[:-1, None]) / np.diff(edges)[:, None], 0.0, 1.0)
+    settings, block_count = state.settings, state.blocks.sizes["block"]
+    steps = component.variant.design[:, 0]
+    at_restarts = component_mixture(component, state).evidence
+
+    edge = (1.0 - steps).sum(axis=1)
+    edges = np.concatenate([[0.0], (edge[1:] + edge[:-1]) / 2.0, [block_count]])
+    middle = np.arange(block_count) + 0.5
+    courses = np.clip((middle - edges[:-1, None]) / np.diff(edges)[:, None], 0.0, 1.0)
     gradual = component_mixture(component, state, _with_course(component, *courses)).evidence
-    steps = component_mixture(component, state).evidence
-    settings = state.settings
     allowed = settings.ambiguous_nats + settings.form_error_share * component.evidence_nats
-    yield Competitor("a gradual change", gradual - steps, allowed)
-    shifts = np.unique(np.linspace(0, block_count, _SHIFTS + 1, endpoint=False).astype(int))[1:]
-    changes = np.diff(component.variant.design[:, 0], prepend=0.0)
+    yield Competitor("a gradual change", gradual - at_restarts, allowed)
+
+    changes = np.diff(steps, prepend=0.0)
     elsewhere = [
         component_mixture(
             component,
             state,
             _with_course(component, *np.roll(changes, shift, axis=1).cumsum(axis=1)),
         ).evidence
-        for shift in shifts
+        for shift in _restart_shifts(changes.argmax(axis=1), state)
     ]
-    counted = int(settings.surrogate_share * (1 + shifts.size))
+    counted = int(settings.surrogate_share * (1 + len(elsewhere)))
     if counted:
-        strongest = float(np.sort(elsewhere)[-counted])
-        yield Competitor("jumps at other instants", strongest - steps, 0.0)
+        nats = float(np.sort(elsewhere)[-counted]) - at_restarts
+        yield Competitor("jumps at other instants", nats, 0.0)
+
+
+def _restart_shifts(restarts: Ints, state: State) -> Ints:
+    """Return shifts [blocks] of restarts (restart,) round the record that meet few others."""
+    block_count = state.blocks.sizes["block"]
+    shifts = np.unique(np.linspace(0, block_count, _SHIFTS + 1, endpoint=False).astype(int))[1:]
+    shifted = (restarts + shifts[:, None, None]) % block_count
+    is_met = (np.abs(shifted - restarts[:, None]) <= 1).any(axis=1)
+    return np.asarray(shifts[is_met.mean(axis=1) <= state.settings.majority_share])
 
 
 def _sum_evidence(jumps: Sequence[Component], state: State, courses: Sequence[Floats]) -> float:

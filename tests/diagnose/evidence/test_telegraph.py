@@ -1,6 +1,7 @@
 """A bias of two levels in the block means: evidence, visits, look-alikes, diagnosis."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +18,10 @@ from gyrostab.diagnose.evidence.telegraph import (
 )
 from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.identifications import Identifications
-from gyrostab.diagnose.identify.naming_order import drop_switching_with_a_cause
+from gyrostab.diagnose.identify.naming_order import (
+    drop_switching_with_a_cause,
+    identify_switching,
+)
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -270,6 +274,27 @@ def test_an_effect_of_a_switching_channel_comes_first(
         "telegraph",
         "bias_jump",
     ]
+
+
+@pytest.mark.parametrize(
+    ("evidence_nats", "axis", "expected"),
+    [(20.0, "x", ["telegraph"]), (60.0, "x", []), (60.0, "y", ["telegraph"])],
+)
+def test_switching_within_blocks_waits_for_an_effect_that_explains_more(
+    evidence_nats: float, axis: str, expected: list[str]
+) -> None:
+    rng = np.random.default_rng(10)
+    course = telegraph_share(rng, 120.0, 180.0)
+    state = state_of(0.6 * course + white(rng, 1)[0])
+    whole = component(state, course)
+    within = replace(whole, variant=replace(whole.variant, inside=np.ones((BLOCKS, 16))))
+    components = {
+        "telegraph": [within],
+        "~levels": [within],
+        "bias_jump": [replace(jump(50, evidence_nats), row=(axis,))],
+    }
+    assert identify_switching(list(components), components, state) == expected
+    assert identify_switching(["telegraph"], {"telegraph": [whole]}, state) == []
 
 
 def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) -> Identifications:

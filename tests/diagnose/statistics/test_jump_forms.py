@@ -249,6 +249,21 @@ def test_a_slow_course_is_not_a_jump_at_every_restart() -> None:
     assert [component.row for component in keep_physical(components, state)[0]] == [("y",)]
 
 
+def test_levels_that_change_at_other_times_are_not_jumps_at_every_restart() -> None:
+    """With 34 gaps, the levels of x change between two of them, those of y at them."""
+    gaps = tuple((begin, begin + 20.0) for begin in np.arange(300.0, 10_500.0, 300.0))
+    sizes = tuple(20.0 * np.random.default_rng(2).standard_normal(len(gaps)))
+    ends = np.array([end for _, end in gaps])
+    steps = np.stack([levels(sizes, tuple(ends + late), 10_800.0) for late in (140.0, 0.0)])
+    model = {"noise": {"N": 0.05, "K": 0.4}, "log": {"axes": ["x", "y"]}}
+    blocks = reduce_log(drifting_log(1, steps, gaps))
+    jumps, state = try_jumps(blocks, baseline_from_model(blocks, model))
+    (every,) = (variant for variant in jumps.variants if len(variant.columns) == len(gaps))
+    forms = {axis: winning_forms([Component(jumps, every, (axis,), 50.0)], state) for axis in "xy"}
+    assert "jumps at other instants" in forms["x"]
+    assert not forms["y"]
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("seed", [1])
 def test_jumps_at_all_restarts_are_sized(seed: int) -> None:
