@@ -6,6 +6,7 @@ Warnings and errors are single lines, and an interruption is orderly.
 from __future__ import annotations
 
 import errno
+import os
 import re
 import signal
 import sys
@@ -14,6 +15,7 @@ import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, TextIO
 
@@ -198,6 +200,16 @@ def _join_duration(error: UnusedCliTokensError) -> str:
     return ""
 
 
+def _find_taken_files(error: MissingArgumentError) -> str:
+    """Say which files options have taken as their values, such as ``--quiet run7.csv``."""
+    tokens = error.root_input_tokens or []
+    return " and ".join(
+        f"{value} is the value of {option}"
+        for option, value in pairwise(tokens)
+        if option.startswith("-") and os.path.exists(value)
+    )
+
+
 def _describe_command_line(error: CycloptsError) -> str:
     """Say what is wrong with a command line."""
     command = " ".join(["gyrostab", *(error.command_chain or ())])
@@ -210,7 +222,9 @@ def _describe_command_line(error: CycloptsError) -> str:
         chosen = next((token for token in rest if token in app), "COMMAND")
         text = f"Options come after the command: gyrostab {chosen} {option} ..."
     elif isinstance(error, MissingArgumentError) and error.argument and not error.keyword:
-        text = f"{error.argument.name.removesuffix('...')} is missing."
+        name = error.argument.name.removesuffix("...")
+        files = "" if name.startswith("-") else _find_taken_files(error)
+        text = f"{name} is missing{files and ': '}{files}."
     else:
         text = str(error)
     return f"{text} See {command} --help."

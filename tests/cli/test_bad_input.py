@@ -194,6 +194,10 @@ BAD_INPUT = {
     ),
     "no worker": (_bad_log("--workers", "0"), "--workers"),
     "no log": (lambda folder: ["-o", folder / "out.nc"], r"LOG is missing\. See gyrostab run"),
+    "log taken by an option": (
+        lambda folder: ["--map", write_log(folder / "good.csv"), "-o", folder / "out.nc"],
+        r"LOG is missing: \S*good\.csv is the value of --map\. See gyrostab run",
+    ),
     "no output": (lambda folder: [write_log(folder / "good.csv")], "--output is missing"),
     "option without its value": (_bad_log("--window"), "--window requires an argument"),
 }

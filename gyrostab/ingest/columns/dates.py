@@ -40,6 +40,11 @@ _HEADER_ZONE = re.compile(
     r"[\[(,_ ]((?:[A-Z]{1,2}[SD]|[CEW]E|[CEMP])T|MSK"
     r"|(?:Africa|America|Asia|Atlantic|Australia|Europe|Indian|Pacific|US)/\w+)[\])]?\s*$"
 )
+#: Names of columns that give the zone of each row, and a cell that gives UTC.
+_ZONE_COLUMN = re.compile(
+    r"(?:tz|time[ _-]?zone)(?:[ _-]?(?:name|offset))?|(?:utc|gmt)[ _-]?offset", re.IGNORECASE
+)
+_UTC = re.compile(r"(?:(?:Etc/)?(?:UTC|GMT)|Z)?[+-]?[0:.]*", re.IGNORECASE)
 #: Years of two digits from this one on are of the 20th century, as in POSIX and `datetime`.
 _FIRST_SHORT_YEAR = 69
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
@@ -114,6 +119,23 @@ def find_zone_name(header: str) -> str | None:
     """
     match = _HEADER_ZONE.search(header)
     return match[1] if match else None
+
+
+def states_zone(name: str, cell: str) -> bool:
+    """Return whether a cell of a column with this name gives another time zone than UTC.
+
+    A column ``zone`` may hold other things, such as formations.
+
+    Examples
+    --------
+    >>> [states_zone("tz", cell) for cell in ("+02:00", "CEST", "7200", "UTC", "+00:00")]
+    [True, True, True, False, False]
+    >>> [states_zone("zone", cell) for cell in ("UTC-06:00", "Europe/Oslo", "3", "B")]
+    [True, True, False, False]
+    """
+    if name.lower() == "zone":
+        return bool(find_offset(cell) or find_offset(f"UTC{cell}") or find_zone_name(f" {cell}"))
+    return bool(_ZONE_COLUMN.fullmatch(name)) and not _UTC.fullmatch(cell)
 
 
 def find_order(cells: Iterable[str]) -> str | None:

@@ -16,10 +16,12 @@ from gyrostab.ingest.columns.dates import (
     find_zone_name,
     has_offset,
     parse_order,
+    states_zone,
 )
 from gyrostab.ingest.columns.headers import (
     KNOWN_CHANNEL_PATTERN,
     TIME_PATTERN,
+    VOID_CELLS,
     Header,
     is_time_unit,
     split_header,
@@ -50,7 +52,7 @@ def find_time(plan: Plan, named: list[Header]) -> Header | None:
         named[:] = [c for c in named if c not in rivals]
     unit = None if column.file.stamped else _time_unit(plan, column)
     order = _date_order(plan, column) if column.file.stamped else YEAR_FIRST
-    epoch = -_find_offset(plan, column) if column.file.stamped else plan.options.epoch_ns
+    epoch = -_find_offset(plan, column, named) if column.file.stamped else plan.options.epoch_ns
     planned = column.source, column.header, "time", "time", "ns"
     plan.columns.append(Column(*planned, time_unit=unit, date_order=order, epoch=epoch))
     written = unit.text if unit else None
@@ -156,8 +158,12 @@ def _date_order(plan: Plan, column: Header) -> str:
     return order or EITHER_FIRST
 
 
-def _find_offset(plan: Plan, column: Header) -> int:
-    """Return the offset from UTC of dates without one [ns]: from the user or the header."""
+def _find_offset(plan: Plan, column: Header, named: Sequence[Header]) -> int:
+    """Return the offset from UTC of dates without one [ns]: from the user or the header.
+
+    A column that gives the zone of each row may change later in the file, and times may be in UTC
+    in spite of it: the user has to say what they are.
+    """
     cells = column.file.cells
     if not cells or any(map(has_offset, cells)):
         return 0
@@ -167,6 +173,8 @@ def _find_offset(plan: Plan, column: Header) -> int:
         plan.used_units.add(key)
         return given
     offset, zone = find_offset(column.header), find_zone_name(column.header)
+    if offset is None and "utc" in column.header.lower():  # time_utc
+        offset = 0
     if offset:
         plan.notes.append(
             f"the times are read with the offset from UTC that the header {column.header!r} names; "
@@ -178,7 +186,25 @@ def _find_offset(plan: Plan, column: Header) -> int:
             f"the header of the time column {column.header!r} names the time zone {zone}; give its "
             "offset from UTC, for instance --unit time=UTC-06:00",
         )
+    elif offset is None and (zone_cell := _find_zone_cell(named)):
+        plan.refuse(
+            UnitError,
+            f"the times have no offset from UTC, and column {zone_cell[0]!r} holds "
+            f"{zone_cell[1]!r}; say what they are: --unit time=UTC, or with the offset of local "
+            "times, for instance --unit time=UTC-06:00",
+        )
     return offset or 0
+
+
+def _find_zone_cell(named: Sequence[Header]) -> tuple[str, str] | None:
+    """Find the first cell that gives another time zone than UTC, with the header of its column."""
+    cells = ((column, cell.strip()) for column in named for cell in column.file.cells)
+    zones = (
+        (column.header, cell)
+        for column, cell in cells
+        if cell.lower() not in VOID_CELLS and states_zone(column.name, cell)
+    )
+    return next(zones, None)
 
 
 def _time_unit(plan: Plan, column: Header) -> TimeUnit | None:

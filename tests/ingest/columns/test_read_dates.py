@@ -212,6 +212,70 @@ def test_name_of_a_zone_in_a_header_is_refused(tmp_path: Path, header: str) -> N
         read_log(path)
 
 
+ZONE_COLUMNS = [
+    ("tz", "+02:00"),
+    ("timezone", "CEST"),
+    ("Time Zone", "Europe/Oslo"),
+    ("utc_offset", "-6"),
+    ("utc_offset [h]", "2"),
+    ("zone", "UTC-06:00"),
+    ("zone", "CEST"),
+]
+
+
+def write_zone(path: Path, column: str, cell: str) -> Path:
+    form = f"%Y-%m-%d %H:%M:%S.%f,{cell}"
+    return write(path, form, f"time,{column},gyro_x [deg/h]")
+
+
+@pytest.mark.parametrize(("column", "cell"), ZONE_COLUMNS)
+def test_zone_in_another_column_is_refused_until_the_user_says_what_the_times_are(
+    tmp_path: Path, column: str, cell: str
+) -> None:
+    path = write_zone(tmp_path / "log.csv", column, cell)
+    with pytest.raises(UnitError, match=rf"{re.escape(repr(cell))}.*--unit time=UTC.*UTC-06:00"):
+        read_log(path)
+    local = read_log(path, unit={"time": "UTC+02:00"})
+    np.testing.assert_array_equal(stamps_of(local), (STAMPS - pd.Timedelta(hours=2)).values)
+    np.testing.assert_array_equal(stamps_of(read_log(path, unit={"time": "UTC"})), STAMPS.values)
+
+
+@pytest.mark.parametrize(
+    ("column", "cell"),
+    [
+        ("tz", "UTC"),
+        ("tz", "+00:00"),
+        ("utc_offset", "0"),
+        ("tz", ""),
+        ("zone", "3"),
+        ("zone", "B"),
+    ],
+)
+def test_column_that_states_no_other_zone_than_utc_is_not_refused(
+    tmp_path: Path, column: str, cell: str
+) -> None:
+    path = write_zone(tmp_path / "log.csv", column, cell)
+    np.testing.assert_array_equal(stamps_of(read_log(path)), STAMPS.values)
+
+
+@pytest.mark.parametrize(
+    ("header", "offset", "hours"),
+    [
+        ("time", "+01:00", -1),
+        ("time_utc", "", 0),
+        ("time [GMT]", "", 0),
+        ("time [UTC-05:00]", "", 5),
+    ],
+)
+def test_zone_in_another_column_is_not_needed_for_times_that_have_one(
+    tmp_path: Path, header: str, offset: str, hours: int
+) -> None:
+    form = f"%Y-%m-%dT%H:%M:%S.%f{offset},+02:00"
+    path = write(tmp_path / "log.csv", form, f"{header},tz,gyro_x [deg/h]")
+    expected = STAMPS + pd.Timedelta(hours=hours)
+    np.testing.assert_array_equal(stamps_of(read_log(path)), expected.values)
+
+
 def test_times_of_day_alone_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UnitError, match=r"'time' holds times of day without a date"):
         read_log(write(tmp_path / "log.csv", "%H:%M:%S.%f"))
