@@ -285,9 +285,9 @@ def _add_clock(plan: Plan, source: int, described: Sequence[FileColumn], *, is_n
     planned = Column(source, own.header, "time", "time", "ns")
     if time is not None and replace(described[time.source], header="") == replace(own, header=""):
         planned = replace(time, source=source)
-    elif own.unit is not None:
+    elif own.stored is not None:
         try:
-            unit = parse_time_unit(own.unit, own.calendar)
+            unit = parse_time_unit(own.stored, own.calendar)
         except UnitError as error:
             plan.refuse(UnitError, str(error))
             return
