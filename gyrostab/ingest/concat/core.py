@@ -98,7 +98,8 @@ def concatenate_logs(
         (source_of(log, Path(path).name) for log, path in zip(logs, paths, strict=True)),
         key=lambda source: source.start,
     )
-    _check_same(sources)
+    check_kinds((source.name, signal_name(source.log)) for source in sources)
+    _check_rates(sources)
     pieces, notes = place_logs(sources, max_gap=duration_seconds(max_gap, "max_gap"))
     rate = sources[0].rate
     start = int(grid_times(sources[0].start, rate, -pieces[0].first))
@@ -167,17 +168,21 @@ def _close_files(files: Sequence[Callable[[], None]]) -> None:
         close()
 
 
-def _check_same(sources: Sequence[Source]) -> None:
-    """Refuse logs whose kind or sampling rate differs from the first."""
-    first = sources[0]
-    kind = signal_name(first.log)
-    for source in sources[1:]:
-        other_kind = signal_name(source.log)
+def check_kinds(kinds: Iterable[tuple[str, str | None]]) -> None:
+    """Refuse files, given by name, whose kind of signal differs from that of the first."""
+    (name, kind), *others = kinds
+    for other_name, other_kind in others:
         if other_kind != kind:
             raise UnitError(
-                f"{first.name} holds a gyro signal of kind {kind!r}, {source.name} of kind "
+                f"{name} holds a gyro signal of kind {kind!r}, {other_name} of kind "
                 f"{other_kind!r}; run them one by one"
             )
+
+
+def _check_rates(sources: Sequence[Source]) -> None:
+    """Refuse logs whose sampling rate differs from that of the first."""
+    first = sources[0]
+    for source in sources[1:]:
         if abs(source.rate / first.rate - 1) > RATE_TOLERANCE:
             raise TimeError(
                 f"{first.name} is a log of {first.rate:.10g} Hz and {source.name} one of "
