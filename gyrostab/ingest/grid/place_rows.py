@@ -32,7 +32,6 @@ from gyrostab.ingest.grid.starting_period import SECOND, Stamps
 from gyrostab.kernels.grid.stamps import (
     DUPLICATE,
     EVENT_BEFORE,
-    EVENT_CAUSE,
     EVENT_ROW,
     EVENT_STAMP,
     NO_STAMP,
@@ -263,9 +262,8 @@ def find_repeats(raw: xr.Dataset, placement: Placement) -> Ints:
 
     Returns (n, 3): first row of the repetition, first row of what it repeats, number of rows.
     """
-    events = placement.events
-    is_break = np.isin(events[:, EVENT_CAUSE], (STEP, RESTART))
-    back = events[is_break & (events[:, EVENT_STAMP] < events[:, EVENT_BEFORE])]
+    breaks = placement.events_of(STEP, RESTART)
+    back = breaks[breaks[:, EVENT_STAMP] < breaks[:, EVENT_BEFORE]]
     repeats: list[tuple[int, int, int]] = []
     for row, stamp in sorted(zip(back[:, 2].tolist(), back[:, 4].tolist(), strict=True)):
         if repeats and row < repeats[-1][0] + repeats[-1][2]:

@@ -39,7 +39,6 @@ from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, record
 from gyrostab.ingest.limits import check_limits
 from gyrostab.ingest.uniform import as_uniform, check_same_rate
 from gyrostab.kernels.grid.stamps import (
-    EVENT_CAUSE,
     EVENT_ROW,
     EVENT_SAMPLE,
     EVENT_STAMP,
@@ -361,7 +360,7 @@ def gather_channel(
 ) -> tuple[NDArray[np.datetime64], Floats]:
     """Return stamps and values of the filled rows of a slow channel."""
     channel = raw[name].data
-    breaks = placement.events[np.isin(placement.events[:, EVENT_CAUSE], (STEP, RESTART))]
+    breaks = placement.events_of(STEP, RESTART)
     breaks = breaks[np.argsort(breaks[:, EVENT_ROW], kind="stable")]
     grid_stamps = grid_times(placement.start, placement.rate, breaks[:, EVENT_SAMPLE] + 1)
     moved = np.concatenate([[0], grid_stamps - breaks[:, EVENT_STAMP]])
