@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyrostab.arrays import Array, Floats, Ints
+from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import FormatError, OptionError, TimeError
 from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Spool
 from gyrostab.ingest.columns.stamps import CLOCK_PERIODS, NAT, read_stamps, typical_step
@@ -21,7 +21,7 @@ from gyrostab.ingest.concat.place import COMPARED_SAMPLES, match_ends
 from gyrostab.schema import SIGNAL_UNITS, texts
 from gyrostab.store.lazy import (
     concatenate_columns,
-    convert_lazy,
+    convert_values,
     make_dask,
     read_slice,
     select_part,
@@ -109,12 +109,8 @@ def _find_turns(step: int, first: int, typical: float) -> tuple[int, int]:
 
 def _move_stamps(part: xr.Dataset, added: int) -> xr.Dataset:
     """Add a time [ns] to the stamps of a raw log."""
-
-    def move(stamps: Array) -> Array:
-        return np.asarray(stamps + np.timedelta64(added, "ns"))
-
-    data = part["time"].data
-    moved = move(data) if isinstance(data, np.ndarray) else convert_lazy(data, move, data.dtype)
+    step = np.timedelta64(added, "ns")
+    moved = convert_values(part["time"].data, lambda stamps: stamps + step, "datetime64[ns]")
     return part.assign_coords(time=(part["time"].dims, moved, part["time"].attrs))
 
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Buffers, find_even
+from gyrostab.ingest.columns.pieces import Buffers, find_even
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.stamps import DATENUM, NAT, TurningClock
 from gyrostab.ingest.options import FileSummary
 from gyrostab.schema import SIGNAL_UNITS
-from gyrostab.store.lazy import Converted, make_dask, read_slice, stack_rows
+from gyrostab.store.lazy import convert_values, read_slice, stack_rows
 from gyrostab.store.write import pack_counts
 from gyrostab.units import DAY
 
@@ -239,9 +239,7 @@ class RawLogBuilder:
         if not self.bad_rows.total or self.low > self.high:
             return stamps
         hide = partial(_hide_others, low=self.low, high=self.high)
-        if isinstance(stamps, np.ndarray):
-            return hide(stamps)
-        return make_dask(Converted(stamps, hide, "datetime64[ns]"), CHUNK_ROWS)
+        return convert_values(stamps, hide, "datetime64[ns]")
 
     def _make_dataset(self, columns: dict[int, Any], stamps: Any) -> xr.Dataset:
         data: dict[str, Any] = {}

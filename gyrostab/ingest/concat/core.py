@@ -19,7 +19,7 @@ from gyrostab.ingest.concat.place import place_logs
 from gyrostab.ingest.gap_table import gap_variables, name_lost
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name, texts
-from gyrostab.store.lazy import concatenate_columns, convert_lazy, take_samples
+from gyrostab.store.lazy import concatenate_columns, convert_values, take_samples
 from gyrostab.store.private import close_function
 from gyrostab.store.write import common_packing
 from gyrostab.time.durations import duration_seconds
@@ -337,12 +337,7 @@ def unify_units(logs: Sequence[tuple[str, xr.Dataset]], name: str, advice: str) 
         factor, offset = conversions[str(variable.attrs.get("units", "1"))] or (1.0, 0.0)
         if (factor, offset) != (1.0, 0.0):
             convert = partial(_scale_values, factor=factor, offset=offset)
-            is_lazy = hasattr(variable.data, "dask")
-            data = (
-                convert_lazy(variable.data, convert, np.float64)
-                if is_lazy
-                else convert(variable.data)
-            )
+            data = convert_values(variable.data, convert, np.float64)
             log = log.assign({name: (variable.dims, data, variable.attrs | {"units": target})})
         unified.append(log)
     return unified
