@@ -187,21 +187,6 @@ def gap_variables(table: Ints, start: int, rate: float) -> dict[str, Any]:
 
 def read_gaps(log: xr.Dataset, start: int, rate: float) -> Ints | None:
     """Read the table of gaps in grid samples (`COLUMNS`); None if it is inconsistent."""
-    columns = read_gap_columns(log)
-    if columns is None:
-        return None
-    first, end, *rest = columns
-    return np.stack(
-        [
-            *(np.rint(grid_index(start, rate, stamps)).astype(np.int64) for stamps in (first, end)),
-            *rest,
-        ],
-        axis=1,
-    )
-
-
-def read_gap_columns(log: xr.Dataset) -> list[Ints] | None:
-    """Return stamps of both ends [ns since 1970], samples, rows, cause; None if inconsistent."""
     columns: list[Ints] = []
     for name, kind in (
         ("gap_start", "M"),
@@ -222,11 +207,9 @@ def read_gap_columns(log: xr.Dataset) -> list[Ints] | None:
                 f"{name!r} holds {int(np.isnat(values).sum())} missing times (NaT); every time "
                 "must be known"
             )
-        columns.append(to_nanoseconds(values) if kind == "M" else values.astype(np.int64))
+        if kind == "M":
+            values = np.rint(grid_index(start, rate, to_nanoseconds(values)))
+        columns.append(values.astype(np.int64))
     first, end, samples, _, cause = columns
-    spoilt = (
-        np.any(end < first)
-        or np.any(samples < 0)
-        or np.any((cause < 0) | (cause >= len(GAP_CAUSES)))
-    )
-    return None if spoilt else columns
+    is_valid = (end >= first) & (samples >= 0) & (cause >= 0) & (cause < len(GAP_CAUSES))
+    return np.stack(columns, axis=1) if is_valid.all() else None
