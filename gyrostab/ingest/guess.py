@@ -210,9 +210,8 @@ def _guess_axes(
         score = _gyro_score(template, list(group.values()), inspection)
         rivals = [rival for rival in steady if rival is not steadiness]
         if rivals and len(group) == 3:
-            score += (
-                0.75 if steadiness <= min(rivals) else -0.75 if steadiness > max(rivals) else 0.0
-            )  # gravity makes the mean of an accelerometer large
+            # gravity makes the mean of an accelerometer large
+            score += 0.75 * (steadiness <= min(rivals)) - 0.75 * (steadiness > max(rivals))
         if score >= MIN_SCORE and (best is None or score > best[0]):
             best = score, group
     if best is None:

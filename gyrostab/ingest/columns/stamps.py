@@ -113,9 +113,8 @@ def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
     name, *since = (part.strip() for part in _SINCE.split(text, maxsplit=1))
     epoch = _epoch_ns(text, since[0], calendar) if since else None
     factor, _, bare = name.rpartition(" ")
-    ns = (
-        None if bare == "Ms" else _NANOSECONDS.get(bare.lower(), _NANOSECONDS.get(bare))
-    )  # Ms is ambiguous: megasecond, or milliseconds mistyped
+    # Ms is ambiguous: megasecond, or milliseconds mistyped
+    ns = None if bare == "Ms" else _NANOSECONDS.get(bare.lower(), _NANOSECONDS.get(bare))
     if ns is None or (
         factor and not (len(factor) <= _MAX_DIGITS and _NUMBER.match(factor.strip()))
     ):

@@ -138,9 +138,8 @@ def concatenate_logs(
         coordinates,
         _common_attributes(sources, size, [*notes, *_describe_absent(sources, axes)]),
     )
-    joined.set_close(
-        partial(_close_files, list(filter(None, map(close_function, logs))))
-    )  # keeps no other reference to the logs
+    # keeps no other reference to the logs
+    joined.set_close(partial(_close_files, list(filter(None, map(close_function, logs)))))
     return joined
 
 

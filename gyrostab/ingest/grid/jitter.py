@@ -114,18 +114,16 @@ def fit_jitter(
         if model.sigma <= _MAX_LOSSY_SIGMA or model.loss_nats > _LOSSY_NATS
     ]
     explained = min(known, key=lambda jitter: jitter.code_length, default=None)
-    return (
-        explained if explained is not None and explained.fits else None
-    )  # the best may fit stamps of doubled rows
+    # the best may fit stamps of doubled rows
+    return explained if explained is not None and explained.fits else None
 
 
 def _start_on_lines(
     observed: list[Block], observe: str, group: float, sure: float
 ) -> list[tuple[float, float]]:
     """Return the best periods [ns] near the slopes of stretches, and their jitter [samples]."""
-    lengths = (
-        (32, 16) if observe == "all" else (8,)
-    )  # with lost samples, only few consecutive groups are complete
+    # with lost samples, only few consecutive groups are complete
+    lengths = (32, 16) if observe == "all" else (8,)
     lines = next(filter(None, (_fit_lines(observed, length) for length in lengths)), None)
     if lines is None or not (lines[0] > 0).any():
         return []
@@ -136,10 +134,8 @@ def _start_on_lines(
     periods = _candidate_periods(observed, slope, group)
     n_rows = max(64, _SEARCH_ROWS // len(observed))
     sample = [(count[:n_rows], stamps[:n_rows]) for count, stamps in observed]
-    best = sorted(periods, key=lambda period: _row_cost(sample, period, sigma_ns, sure))[
-        :_MAX_REFINED
-    ]
-    return [(period, sigma_ns / period) for period in best]
+    best = sorted(periods, key=lambda period: _row_cost(sample, period, sigma_ns, sure))
+    return [(period, sigma_ns / period) for period in best[:_MAX_REFINED]]
 
 
 def fit_jitter_near(
@@ -234,10 +230,8 @@ def _refine_model(
             sums = piece_sums(stamps[is_near], sample[is_near], piece[is_near], period)
             cc, ct = cc + sums[:, 3].sum(), ct + sums[:, 4].sum()
             nats, rows = nats + cost, rows + len(count)
-            sample_step, count_step = (
-                np.diff(sample)[np.diff(piece) == 0],
-                np.diff(count)[np.diff(piece) == 0],
-            )
+            is_unbroken = np.diff(piece) == 0
+            sample_step, count_step = np.diff(sample)[is_unbroken], np.diff(count)[is_unbroken]
             dropped += (np.maximum(count_step - sample_step, 0)).sum()
             single, steps = single + (sample_step == count_step).sum(), steps + len(sample_step)
             offs.append(off)

@@ -121,10 +121,8 @@ class RowPlacer:
                 estimate, note = self._estimate_declared(stamps, estimate, declared)
                 notes.append(note)
             # a given rate settles the question
-            rate, estimate = (
-                declared,
-                replace(estimate, rate_with_losses=None, rate_without_losses=None),
-            )
+            rate = declared
+            estimate = replace(estimate, rate_with_losses=None, rate_without_losses=None)
         deviating: list[DeviatingStretch] = []
         if estimate.places_by_count:
             stamps_to_count = partial(stamp_blocks, raw, scanned, all_rows=count_all_rows)
@@ -183,10 +181,8 @@ class RowPlacer:
     ) -> tuple[RateEstimate, str]:
         """Estimate the rate near a declared one that the stamps alone do not say, with a note."""
         near_estimate = estimate_near(stamps, declared)
-        named = (
-            estimate.rate_without_losses is not None
-            and abs(declared / estimate.rate_without_losses - 1) <= _MAX_RATE_DIFFERENCE
-        )  # without the recurring losses
+        lower = estimate.rate_without_losses or np.inf  # without the recurring losses
+        named = abs(declared / lower - 1) <= _MAX_RATE_DIFFERENCE
         if (
             near_estimate is None
             or abs(declared / near_estimate.unrounded - 1) > _MAX_RATE_DIFFERENCE
