@@ -20,8 +20,8 @@ from gyrostab.ingest.formats.text import read_head
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.ingest.grid.scan_pass import find_spans
-from gyrostab.ingest.guess import Guess, guess_columns
-from gyrostab.ingest.guess_unit import temperature_unit
+from gyrostab.ingest.guess import guess_columns
+from gyrostab.ingest.guess_unit import Guess, temperature_unit
 from gyrostab.ingest.inspect import FileInspection, inspect_file
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.ingest.reading import read_log
