@@ -193,15 +193,10 @@ def _check_rates(sources: Sequence[Source]) -> None:
 def _describe_absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:
     """Return notes on axes and channels that some logs lack, unless those hold other axes."""
     groups = group_axes(sources, [source.axes for source in sources])
-    names = {
-        f"axis {axis}": _logs_without(groups, [s for s in sources if axis in s.axes])
-        for axis in axes
-    }
+    holders = {f"axis {axis}": [s for s in sources if axis in s.axes] for axis in axes}
     for channel in dict.fromkeys(name for source in sources for name in log_channels(source.log)):
-        names[f"channel {channel}"] = _logs_without(
-            groups, [source for source in sources if channel in source.log]
-        )
-    return absence_notes(names)
+        holders[f"channel {channel}"] = [source for source in sources if channel in source.log]
+    return absence_notes({name: _logs_without(groups, logs) for name, logs in holders.items()})
 
 
 def _logs_without(groups: Sequence[Sequence[Source]], holders: Sequence[Source]) -> list[str]:

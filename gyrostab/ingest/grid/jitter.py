@@ -8,7 +8,7 @@ packets, or a slow clock gives many rows one stamp, only one row of each group i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -211,21 +211,27 @@ def _row_cost(observed: list[Block], period: float, sigma_ns: float, sure: float
     return float(total / sum(len(count) for count, _ in observed))
 
 
+def _follow(
+    count: Ints, stamps: Ints, jitter: JitterModel, gain: float, longest: float
+) -> tuple[Ints, Ints, Floats, float]:
+    """Return sample and piece of each row, its distance from the sample [samples], and the cost."""
+    law = jitter.period, max(jitter.sigma, MIN_SIGMA), gain, longest, jitter.loss_nats
+    sample, piece, off, nats = follow(count, stamps, *law, TRACE_ROWS)
+    return sample, piece, off, nats
+
+
 def _refine_model(
     observed: list[Block], jitter: JitterModel, sure: float, *, most_off: float = 0.05
 ) -> JitterModel | None:
     """Refine period and jitter along the sequence of samples; None if the fit fails."""
     if not observed:
         return None
-    period, sigma, loss_nats = jitter.period, jitter.sigma, LOSS_NATS
+    start, period, sigma = jitter.period, jitter.period, jitter.sigma
     for gain in (_SEARCH_GAIN, _SEARCH_GAIN / 2, GAIN, GAIN):
         cc = ct = nats = rows = dropped = single = steps = 0.0
         offs, losses = [], []
         for count, stamps in observed:
-            floored_sigma = max(sigma, MIN_SIGMA)
-            sample, piece, off, cost = follow(
-                count, stamps, period, floored_sigma, gain, sure * period, loss_nats, TRACE_ROWS
-            )
+            sample, piece, off, cost = _follow(count, stamps, jitter, gain, sure * period)
             is_near = _is_near(off, sigma)
             sums = piece_sums(stamps[is_near], sample[is_near], piece[is_near], period)
             cc, ct = cc + sums[:, 3].sum(), ct + sums[:, 4].sum()
@@ -240,9 +246,10 @@ def _refine_model(
             return None
         period = float(ct / cc)
         sigma = 1.4826 * float(np.median(np.abs(np.concatenate(offs))))
-        correction, loss_nats = _price_losses(np.concatenate(losses), loss_nats)
+        correction, loss_nats = _price_losses(np.concatenate(losses), jitter.loss_nats)
+        jitter = replace(jitter, period=period, sigma=sigma, loss_nats=loss_nats)
         nats += correction
-        if not abs(period / jitter.period - 1) < most_off or sigma > 2 * _MAX_SIGMA:
+        if not abs(period / start - 1) < most_off or sigma > 2 * _MAX_SIGMA:
             return None
     fits = (
         sigma < _MAX_SIGMA
@@ -250,7 +257,7 @@ def _refine_model(
         and nats < _MAX_NATS * rows
         and single > 0.1 * steps
     )
-    return JitterModel(period, sigma, jitter.observe, jitter.group, nats / rows, loss_nats, fits)
+    return replace(jitter, nats=nats / rows, fits=fits)
 
 
 def _price_losses(lost: Ints, loss_nats: float) -> tuple[float, float]:
@@ -279,16 +286,7 @@ def count_samples(
     at = observe_rows(stamps, jitter.observe, jitter.period)
     if jitter.observe != "all":
         at = at[1:-1]  # the groups at both ends may be cut
-    sample, piece, off, _ = follow(
-        rows[at],
-        stamps[at],
-        jitter.period,
-        max(jitter.sigma, MIN_SIGMA),
-        GAIN,
-        longest,
-        jitter.loss_nats,
-        TRACE_ROWS,
-    )
+    sample, piece, off, _ = _follow(rows[at], stamps[at], jitter, GAIN, longest)
     is_near = _is_near(off, jitter.sigma)
     return stamps[at][is_near], sample[is_near], piece[is_near]
 
