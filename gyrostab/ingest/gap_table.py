@@ -11,7 +11,7 @@ import xarray as xr
 from gyrostab.arrays import Ints
 from gyrostab.errors import SchemaError
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.time.grid import grid_index, grid_times
+from gyrostab.time.grid import grid_index, grid_times, time_coordinate
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 from gyrostab.units import HOUR
 
@@ -183,6 +183,18 @@ def gap_variables(table: Ints, start: int, rate: float) -> dict[str, Any]:
             {"long_name": "cause of the gap", **flags},
         ),
     }
+
+
+def make_dataset(
+    variables: dict[str, Any],
+    coordinates: dict[str, Any],
+    table: Ints,
+    grid: tuple[int, float, int],
+    attributes: dict[str, Any],
+) -> xr.Dataset:
+    """Make a regular log with a table of gaps; `grid` is start [ns since 1970], rate [Hz], size."""
+    axes = xr.Coordinates(coordinates).merge(time_coordinate(*grid)).coords
+    return xr.Dataset({**variables, **gap_variables(table, *grid[:2])}, axes, attributes)
 
 
 def read_gaps(log: xr.Dataset, start: int, rate: float) -> Ints | None:

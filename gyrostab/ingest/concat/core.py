@@ -16,14 +16,14 @@ from gyrostab.errors import TimeError, UnitError
 from gyrostab.ingest.concat.grid import PlacedLog, Source, group_axes, merge_gaps, source_of
 from gyrostab.ingest.concat.lazy import PlacedArray, chunk_of, place_on_grid
 from gyrostab.ingest.concat.place import place_logs
-from gyrostab.ingest.gap_table import gap_variables, name_lost
+from gyrostab.ingest.gap_table import make_dataset, name_lost
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name, texts
 from gyrostab.store.lazy import concatenate_columns, convert_values, take_samples
 from gyrostab.store.private import close_function
 from gyrostab.store.write import common_packing
 from gyrostab.time.durations import duration_seconds
-from gyrostab.time.grid import grid_index, grid_times, time_coordinate
+from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import extend_history, format_stamp, to_nanoseconds
 from gyrostab.units import find_conversion
 from gyrostab.wording import list_some
@@ -123,19 +123,11 @@ def concatenate_logs(
     )
     signal.encoding = common_packing(source.log[name].encoding for source in sources)
     channels, stamps = concatenate_channels(pieces, start, rate, size, chunk)
-    coordinates = (
-        xr.Coordinates({"axis": np.array(axes, dtype=str), **stamps})
-        .merge(time_coordinate(start, rate, size))
-        .coords
-    )
-    variables = {
-        name: signal,
-        **channels,
-        **gap_variables(name_lost(merge_gaps(pieces), lost, start, rate), start, rate),
-    }
-    joined = xr.Dataset(
-        variables,
-        coordinates,
+    joined = make_dataset(
+        {name: signal, **channels},
+        {"axis": np.array(axes, dtype=str), **stamps},
+        name_lost(merge_gaps(pieces), lost, start, rate),
+        (start, rate, size),
         _common_attributes(sources, size, [*notes, *_describe_absent(sources, axes)]),
     )
     # keeps no other reference to the logs

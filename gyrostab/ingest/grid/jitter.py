@@ -211,7 +211,7 @@ def _row_cost(observed: list[Block], period: float, sigma_ns: float, sure: float
     return float(total / sum(len(count) for count, _ in observed))
 
 
-def _follow(
+def _follow_rows(
     count: Ints, stamps: Ints, jitter: JitterModel, gain: float, longest: float
 ) -> tuple[Ints, Ints, Floats, float]:
     """Return sample and piece of each row, its distance from the sample [samples], and the cost."""
@@ -231,7 +231,7 @@ def _refine_model(
         cc = ct = nats = rows = dropped = single = steps = 0.0
         offs, losses = [], []
         for count, stamps in observed:
-            sample, piece, off, cost = _follow(count, stamps, jitter, gain, sure * period)
+            sample, piece, off, cost = _follow_rows(count, stamps, jitter, gain, sure * period)
             is_near = _is_near(off, sigma)
             sums = piece_sums(stamps[is_near], sample[is_near], piece[is_near], period)
             cc, ct = cc + sums[:, 3].sum(), ct + sums[:, 4].sum()
@@ -286,7 +286,7 @@ def count_samples(
     at = observe_rows(stamps, jitter.observe, jitter.period)
     if jitter.observe != "all":
         at = at[1:-1]  # the groups at both ends may be cut
-    sample, piece, off, _ = _follow(rows[at], stamps[at], jitter, GAIN, longest)
+    sample, piece, off, _ = _follow_rows(rows[at], stamps[at], jitter, GAIN, longest)
     is_near = _is_near(off, jitter.sigma)
     return stamps[at][is_near], sample[is_near], piece[is_near]
 

@@ -240,7 +240,7 @@ def _change_rate(table: Table, ratio: float) -> Table:
 def _add_holes(table: Table, runs: Table) -> Table:
     """Add the samples between runs that the table does not list, with cause "missing"."""
     first, end = runs[:-1, 0] + runs[:-1, 2], runs[1:, 0]
-    begin, stop = merge_lines(table[table[:, END] > table[:, FIRST]])
+    begin, stop = merge_spans([table[table[:, END] > table[:, FIRST]][:, [FIRST, END]]]).T
     if len(begin):  # clip by listed gaps at either end, then count listed samples within
         which = np.maximum(np.searchsorted(begin, first, side="right") - 1, 0)
         first = np.where((begin[which] <= first) & (first < stop[which]), stop[which], first)
@@ -261,16 +261,12 @@ def _add_holes(table: Table, runs: Table) -> Table:
 
 def merge_spans(spans: Sequence[Table]) -> Table:
     """Return the union of half-open spans (first, end), in order."""
-    return np.stack(merge_lines(np.concatenate([*spans, np.empty((0, 2), np.int64)])), axis=1)
-
-
-def merge_lines(table: Table) -> tuple[Ints, Ints]:
-    """Return first samples and ends of the union of the lines of a table."""
-    order = np.argsort(table[:, FIRST], kind="stable")
-    first, end = table[order, FIRST], np.maximum.accumulate(table[order, END])
+    table = np.concatenate([*spans, np.empty((0, 2), np.int64)])
+    first, end = table[np.argsort(table[:, 0], kind="stable")].T
+    end = np.maximum.accumulate(end)
     is_apart = first[1:] > end[:-1]
     edge = np.ones(min(len(table), 1), dtype=bool)
-    return first[np.append(edge, is_apart)], end[np.append(is_apart, edge)]
+    return np.stack([first[np.append(edge, is_apart)], end[np.append(is_apart, edge)]], axis=1)
 
 
 def add_spans(table: Table, spans: Table, cause: int) -> Table:
