@@ -14,7 +14,7 @@ import xarray as xr
 from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import FormatError, OptionError, TimeError
 from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Spool
-from gyrostab.ingest.columns.stamps import CLOCK_PERIODS, NAT, read_stamps, typical_step
+from gyrostab.ingest.columns.stamps import CLOCK_PERIODS, NAT, find_turns, read_stamps, typical_step
 from gyrostab.ingest.concat.core import absence_notes, check_kinds, merge_notes, unify_units
 from gyrostab.ingest.concat.grid import group_axes, split_axes
 from gyrostab.ingest.concat.place import COMPARED_SAMPLES, match_ends
@@ -78,9 +78,8 @@ def continue_clocks(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
         if last == NAT:
             return list(parts)
         if continued and first + added < end:
-            period, turns = _find_turns(
-                first + added - end, first - part.attrs["clock_zero"], typical
-            )
+            begin = first - part.attrs["clock_zero"]
+            period, turns = find_turns(first + added - end, typical, first=begin)
             if not turns:
                 return list(parts)
             added += turns * period
@@ -93,18 +92,6 @@ def continue_clocks(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
         end, typical = last + added, typical_step(read_stamps(part, 0, _FIRST_ROWS))
         continued.append(_move_stamps(part, added) if added else part)
     return continued
-
-
-def _find_turns(step: int, first: int, typical: float) -> tuple[int, int]:
-    """Return the period of a clock and the number of periods that it was set back, or 0.
-
-    `first` is the stamp after the step, from the zero of the clock.
-    """
-    for period in CLOCK_PERIODS:
-        turns, rest = -(step // period), step % period
-        if 0 < rest <= 2 * typical < period / 2 and -period / 2 <= first < period:
-            return period, turns
-    return 0, 0
 
 
 def _move_stamps(part: xr.Dataset, added: int) -> xr.Dataset:
