@@ -5,30 +5,29 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyrostab.arrays import Array, Floats, Ints
-from gyrostab.errors import FormatError, OptionError, TimeError, UnitError
+from gyrostab.arrays import Floats, Ints
+from gyrostab.errors import FormatError, OptionError, TimeError
 from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Spool
-from gyrostab.ingest.columns.stamps import CLOCK_PERIODS, NAT, read_stamps, typical_step
-from gyrostab.ingest.concat.core import absence_notes, merge_notes, unify_units
+from gyrostab.ingest.columns.stamps import CLOCK_PERIODS, NAT, find_turns, read_stamps, typical_step
+from gyrostab.ingest.concat.core import absence_notes, check_kinds, merge_notes, unify_units
 from gyrostab.ingest.concat.grid import group_axes, split_axes
 from gyrostab.ingest.concat.place import COMPARED_SAMPLES, match_ends
 from gyrostab.schema import SIGNAL_UNITS, texts
 from gyrostab.store.lazy import (
     concatenate_columns,
-    convert_lazy,
+    convert_values,
     make_dask,
     read_slice,
     select_part,
     stack_rows,
 )
 from gyrostab.store.write import common_packing
-from gyrostab.units import find_conversion
 from gyrostab.wording import list_some
 
 #: Largest distance of first stamps from the zero of their clock [lengths of the shortest file].
@@ -79,9 +78,8 @@ def continue_clocks(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
         if last == NAT:
             return list(parts)
         if continued and first + added < end:
-            period, turns = _find_turns(
-                first + added - end, first - part.attrs["clock_zero"], typical
-            )
+            begin = first - part.attrs["clock_zero"]
+            period, turns = find_turns(first + added - end, typical, first=begin)
             if not turns:
                 return list(parts)
             added += turns * period
@@ -96,26 +94,10 @@ def continue_clocks(parts: Sequence[xr.Dataset]) -> list[xr.Dataset]:
     return continued
 
 
-def _find_turns(step: int, first: int, typical: float) -> tuple[int, int]:
-    """Return the period of a clock and the number of periods that it was set back, or 0.
-
-    `first` is the stamp after the step, from the zero of the clock.
-    """
-    for period in CLOCK_PERIODS:
-        turns, rest = -(step // period), step % period
-        if 0 < rest <= 2 * typical < period / 2 and -period / 2 <= first < period:
-            return period, turns
-    return 0, 0
-
-
 def _move_stamps(part: xr.Dataset, added: int) -> xr.Dataset:
     """Add a time [ns] to the stamps of a raw log."""
-
-    def move(stamps: Array) -> Array:
-        return np.asarray(stamps + np.timedelta64(added, "ns"))
-
-    data = part["time"].data
-    moved = move(data) if isinstance(data, np.ndarray) else convert_lazy(data, move, data.dtype)
+    step = np.timedelta64(added, "ns")
+    moved = convert_values(part["time"].data, lambda stamps: stamps + step, "datetime64[ns]")
     return part.assign_coords(time=(part["time"].dims, moved, part["time"].attrs))
 
 
@@ -131,7 +113,8 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     else:
         split_parts = [group for part in parts for group in split_axes(part)]
         is_timed = _have_stamps(split_parts)
-        signal = _common_signal(split_parts)
+        check_kinds((part.attrs["source_files"][0], part.attrs.get("kind")) for part in split_parts)
+        signal = next((name for name in SIGNAL_UNITS if name in split_parts[0].data_vars), None)
         ordered = [
             part.drop_vars([*names, *(f"time_{name}" for name in names)])
             for part, names in zip(split_parts, map(_slow_channels, split_parts), strict=True)
@@ -212,18 +195,6 @@ def _begin_at_zero(parts: Sequence[xr.Dataset]) -> bool:
     firsts, lasts = np.array(list(map(stamp_span, parts))).T
     begins = firsts - [part.attrs["clock_zero"] for part in parts]
     return bool(np.abs(begins).max() <= _MAX_BEGIN * (lasts - firsts).min())
-
-
-def _common_signal(parts: Sequence[xr.Dataset]) -> str | None:
-    """Return the name of the gyro signal of all files, None if they hold channels only."""
-    (name, kind), *others = [(p.attrs["source_files"][0], p.attrs.get("kind")) for p in parts]
-    for other_name, other_kind in others:
-        if other_kind != kind:
-            raise UnitError(
-                f"{name} holds a gyro signal of kind {kind!r}, {other_name} of kind "
-                f"{other_kind!r}; read them one by one"
-            )
-    return next((name for name in SIGNAL_UNITS if name in parts[0].data_vars), None)
 
 
 def _concatenate_parts(
@@ -307,70 +278,59 @@ def attach_channels(log: xr.Dataset, sources: Sequence[xr.Dataset]) -> xr.Datase
 
     A row that several files hold, with one stamp and value, counts once.
     """
-    pieces: dict[str, list[tuple[Array, Array, str]]] = {}
-    files = [source.attrs["source_files"][0] for source in sources]
-    for name, source in zip(files, sources, strict=True):
-        for channel, stamps, values, units in _read_channels(source, name):
+    holders: dict[str, list[tuple[str, xr.Dataset]]] = {}
+    for source in sources:
+        name = source.attrs["source_files"][0]
+        for channel in _stamped_channels(source, name):
             if channel in log.variables:
                 fix = (
                     f"rename it with --map {channel}={channel}_2 or drop it with --map {channel}=-"
                 )
                 raise OptionError(f"channel {channel!r} of {name} is in the log too; {fix}")
-            pieces.setdefault(channel, []).append((stamps, values, units))
-    for channel, parts in pieces.items():
-        stamps_of_files, values_of_files, file_units = zip(*parts, strict=True)
-        conversions = [find_conversion(unit, file_units[0]) for unit in file_units]
-        if None in conversions:
-            raise UnitError(
-                f"channel {channel!r} has different units in {list_some(files)}: "
-                f"{list_some(sorted(set(file_units)))}; {_ADVICE.format(channel)}"
-            )
-        numbers = [
-            array * conversion[0] + conversion[1] if conversion else array
-            for array, conversion in zip(values_of_files, conversions, strict=True)
-        ]
-        rows = pd.DataFrame(
-            {
-                "stamp": np.concatenate(stamps_of_files),
-                "value": np.concatenate(numbers),
-                "file": np.repeat(np.arange(len(numbers)), list(map(len, numbers))),
-            }
-        )
-        if len(numbers) > 1:  # a row that several files hold is that of the first
+            holders.setdefault(channel, []).append((name, source))
+    for channel, files in holders.items():
+        unified = unify_units(files, channel, _ADVICE.format(channel))
+        parts = [_filled_rows(part, channel).assign(file=n) for n, part in enumerate(unified)]
+        rows = pd.concat(parts, ignore_index=True)
+        if len(parts) > 1:  # a row that several files hold is that of the first
             first = rows.groupby(["stamp", "value"])["file"].transform("min")
             rows = rows[rows["file"] == first]
         rows, dim = rows.sort_values("stamp", kind="stable"), f"time_{channel}"
+        units = str(unified[0][channel].attrs.get("units", "1"))
         log = log.assign_coords({dim: (dim, rows["stamp"].to_numpy())}).assign(
-            {channel: (dim, rows["value"].to_numpy(), {"units": file_units[0]})}
+            {channel: (dim, rows["value"].to_numpy(), {"units": units})}
         )
     return log
 
 
-def _read_channels(source: xr.Dataset, name: str) -> list[tuple[str, Array, Array, str]]:
-    channels = []
-    for channel, variable in source.data_vars.items():
-        dim = f"time_{channel}" if f"time_{channel}" in source.variables else "time"
-        if (
-            len(variable.dims) != 1
-            or channel in SIGNAL_UNITS
-            or str(variable.dims[0]) not in ("row", "time", dim)
-        ):
-            continue
-        if dim not in source.variables:
-            raise OptionError(
-                f"--channel {name}: it has no time column, so its rows cannot be placed; add "
-                "one, or --map NAME=time"
-            )
-        stamps, values = np.asarray(source[dim].values), np.asarray(variable.values)
-        filled = np.isfinite(values) & ~np.isnat(stamps)
-        channels.append(
-            (str(channel), stamps[filled], values[filled], str(variable.attrs.get("units", "1")))
-        )
+def _stamped_channels(source: xr.Dataset, file: str) -> list[str]:
+    """Name the channels of a file that have one value a stamp."""
+    channels = [
+        str(channel)
+        for channel, variable in source.data_vars.items()
+        if channel not in SIGNAL_UNITS
+        and variable.dims in (("row",), ("time",), (_clock_of(source, str(channel)),))
+    ]
     if not channels:
         raise OptionError(
-            f"--channel {name}: it holds no channel with a unit; give one with --unit NAME=UNIT"
+            f"--channel {file}: it holds no channel with a unit; give one with --unit NAME=UNIT"
+        )
+    if not all(_clock_of(source, channel) in source.variables for channel in channels):
+        raise OptionError(
+            f"--channel {file}: it has no time column, so its rows cannot be placed; add "
+            "one, or --map NAME=time"
         )
     return channels
+
+
+def _clock_of(source: xr.Dataset, channel: str) -> str:
+    return f"time_{channel}" if f"time_{channel}" in source.variables else "time"
+
+
+def _filled_rows(source: xr.Dataset, channel: str) -> pd.DataFrame:
+    stamps, values = (source[name].values for name in (_clock_of(source, channel), channel))
+    is_filled = np.isfinite(values) & ~np.isnat(stamps)
+    return pd.DataFrame({"stamp": stamps[is_filled], "value": values[is_filled]})
 
 
 def drop_repeats(
@@ -397,16 +357,15 @@ def drop_repeats(
             tail, head = _rows_from(held, first), _rows_until(part, held_end)
             if not _is_copy(held, part, signal, tail, head):
                 continue
-            ours, theirs = (
-                _extent_of(held, signal, slice(tail, None)),
-                _extent_of(part, signal, slice(head)),
-            )
-            is_fuller = theirs.cells > ours.cells and theirs.rows >= ours.rows
-            if is_fuller and theirs.columns >= ours.columns and end >= held_end:
+            ours, theirs = ({*_axis_names(log), *log.data_vars} for log in (held, part))
+            size = held.sizes["row"]
+            cells = _count_filled(held, signal, tail, size), _count_filled(part, signal, 0, head)
+            is_fuller = cells[1] > cells[0] and head >= size - tail
+            if is_fuller and theirs >= ours and end >= held_end:
                 # it contains cells that the earlier file lost
                 held, part = _drop_rows(held, slice(0, tail), part)
                 held_end = first - 1
-            elif theirs.columns <= ours.columns:
+            elif theirs <= ours:
                 part, held = _drop_rows(part, slice(head, None), held)
                 first, end = stamp_span(part)
             else:
@@ -421,24 +380,14 @@ def drop_repeats(
     return [log for log, _ in kept_parts], parts_apart
 
 
-class _Extent(NamedTuple):
-    """Rows of a file, its axes and channels, and how many cells of these are filled."""
-
-    rows: int
-    columns: set[str]
-    cells: int
-
-
-def _extent_of(part: xr.Dataset, signal: str, rows: slice) -> _Extent:
-    """Return the extent of some rows; cells of the signal are read if some are unreadable."""
-    begin, end, _ = rows.indices(part.sizes["row"])
-    columns = {*_axis_names(part), *map(str, part.data_vars)}
-    cells = (end - begin) * len(columns)
+def _count_filled(part: xr.Dataset, signal: str, begin: int, end: int) -> int:
+    """Count the filled cells of some rows; those of the signal are read if some are unreadable."""
+    count = (end - begin) * len({*_axis_names(part), *part.data_vars})
     if part.attrs["unreadable_rows"] or part.attrs["unreadable_cells"]:
         for start in range(begin, end, _BLOCK_ROWS):
             block = read_slice(part[signal].data, start, min(start + _BLOCK_ROWS, end))
-            cells -= int(np.count_nonzero(np.isnan(block)))
-    return _Extent(end - begin, columns, cells)
+            count -= int(np.count_nonzero(np.isnan(block)))
+    return count
 
 
 def _drop_rows(part: xr.Dataset, rows: slice, other: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:

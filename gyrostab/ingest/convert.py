@@ -35,7 +35,7 @@ from gyrostab.schema import (
     refuse_multi_index,
 )
 from gyrostab.store.cf import DECODING
-from gyrostab.store.lazy import convert_lazy, hide_infinite
+from gyrostab.store.lazy import convert_values, hide_infinite
 from gyrostab.store.private import is_in_memory
 from gyrostab.store.read import MIN_LAZY_VALUES, make_variable_lazy
 from gyrostab.store.write import declare_counts
@@ -107,12 +107,7 @@ def _is_packed(variable: xr.Variable) -> bool:
 
 def _decode_variable(name: Any, variable: xr.Variable) -> xr.Variable:
     packing = Packing.from_attributes(str(name), variable.dtype, variable.attrs)
-    data = variable.data
-    values = (
-        convert_lazy(data, packing.read_values, np.dtype(float))
-        if hasattr(data, "dask")
-        else packing.read_values(data)
-    )
+    values = convert_values(variable.data, packing.read_values, np.float64)
     attrs = {key: value for key, value in variable.attrs.items() if key not in DECODING}
     return xr.Variable(variable.dims, values, attrs)
 

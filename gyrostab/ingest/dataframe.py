@@ -189,10 +189,8 @@ def _name_keywords(message: str) -> str:
     """
 
     def name_keyword(match: re.Match[str]) -> str:
-        option, value = (
-            match[1].replace("-", "_"),
-            next(filter(None, match.groups()[1:]), "").strip('"'),
-        )
+        option = match[1].replace("-", "_")
+        value = next(filter(None, match.groups()[1:]), "").strip('"')
         keyword = "units" if option == "unit" else option
         key, equals, target = value.rpartition("=")
         if equals:

@@ -36,10 +36,7 @@ class Reader(Protocol):
 
 @cache
 def _entry_points() -> dict[str, Any]:
-    return {
-        point.name: point
-        for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)
-    }
+    return {point.name: point for point in entry_points(group=GROUP)}
 
 
 def readers() -> tuple[str, ...]:
@@ -50,7 +47,7 @@ def readers() -> tuple[str, ...]:
     >>> "text" in readers()
     True
     """
-    return tuple(_entry_points())
+    return tuple(sorted(_entry_points()))
 
 
 def find_reader(path: Path) -> Reader:

@@ -11,7 +11,7 @@ import xarray as xr
 from gyrostab.arrays import Ints
 from gyrostab.errors import SchemaError
 from gyrostab.schema import GAP_CAUSES
-from gyrostab.time.grid import grid_index, grid_times
+from gyrostab.time.grid import grid_index, grid_times, time_coordinate
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 from gyrostab.units import HOUR
 
@@ -185,23 +185,20 @@ def gap_variables(table: Ints, start: int, rate: float) -> dict[str, Any]:
     }
 
 
+def make_dataset(
+    variables: dict[str, Any],
+    coordinates: dict[str, Any],
+    table: Ints,
+    grid: tuple[int, float, int],
+    attributes: dict[str, Any],
+) -> xr.Dataset:
+    """Make a regular log with a table of gaps; `grid` is start [ns since 1970], rate [Hz], size."""
+    axes = xr.Coordinates(coordinates).merge(time_coordinate(*grid)).coords
+    return xr.Dataset({**variables, **gap_variables(table, *grid[:2])}, axes, attributes)
+
+
 def read_gaps(log: xr.Dataset, start: int, rate: float) -> Ints | None:
     """Read the table of gaps in grid samples (`COLUMNS`); None if it is inconsistent."""
-    columns = read_gap_columns(log)
-    if columns is None:
-        return None
-    first, end, *rest = columns
-    return np.stack(
-        [
-            *(np.rint(grid_index(start, rate, stamps)).astype(np.int64) for stamps in (first, end)),
-            *rest,
-        ],
-        axis=1,
-    )
-
-
-def read_gap_columns(log: xr.Dataset) -> list[Ints] | None:
-    """Return stamps of both ends [ns since 1970], samples, rows, cause; None if inconsistent."""
     columns: list[Ints] = []
     for name, kind in (
         ("gap_start", "M"),
@@ -222,11 +219,9 @@ def read_gap_columns(log: xr.Dataset) -> list[Ints] | None:
                 f"{name!r} holds {int(np.isnat(values).sum())} missing times (NaT); every time "
                 "must be known"
             )
-        columns.append(to_nanoseconds(values) if kind == "M" else values.astype(np.int64))
+        if kind == "M":
+            values = np.rint(grid_index(start, rate, to_nanoseconds(values)))
+        columns.append(values.astype(np.int64))
     first, end, samples, _, cause = columns
-    spoilt = (
-        np.any(end < first)
-        or np.any(samples < 0)
-        or np.any((cause < 0) | (cause >= len(GAP_CAUSES)))
-    )
-    return None if spoilt else columns
+    is_valid = (end >= first) & (samples >= 0) & (cause >= 0) & (cause < len(GAP_CAUSES))
+    return np.stack(columns, axis=1) if is_valid.all() else None

@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from operator import itemgetter
 
 from gyrostab.ingest.columns.headers import (
@@ -29,6 +28,7 @@ from gyrostab.ingest.columns.headers import (
 )
 from gyrostab.ingest.guess_unit import (
     TYPICAL_RATE_HZ,
+    Guess,
     given_unit,
     guess_time,
     guess_unit,
@@ -63,28 +63,6 @@ _DERIVED = re.compile(
 )
 
 
-@dataclass(frozen=True)
-class Guess:
-    """Guessed roles of the columns of a file, with the reasons.
-
-    `axes` are the columns of the gyro by axis (empty if no column looks like one); `unit` is the
-    unit to give for them, None if they carry one; `time` and `time_unit` likewise (of dates, the
-    order of day and month); `kind` is the kind to give for angles; `rate` [Hz] is set for a file
-    without time. `sampling_rate_hz` is the rate that the guess is based on.
-    """
-
-    axes: dict[str, ColumnInspection]
-    unit: str | None
-    time: ColumnInspection | None
-    time_unit: str | None
-    rate: float | None
-    temperature: ColumnInspection | None
-    reasons: tuple[str, ...]
-    warnings: tuple[str, ...]
-    sampling_rate_hz: float = math.nan
-    kind: str | None = None
-
-
 def guess_columns(
     inspection: FileInspection,
     *,
@@ -97,46 +75,31 @@ def guess_columns(
     `rate` [Hz] and `kind` are those that the user gives, `rate_hint` is the sampling rate that a
     text in the file contains.
     """
-    reasons: list[str] = []
-    warnings: list[str] = []
-    time, time_unit, assumed = None, None, None
+    guess = Guess()
     if inspection.time is None:
-        time, time_unit = guess_time(inspection, reasons, warnings)
+        guess_time(inspection, guess)
     if inspection.date_spans_s:
-        time_unit = _choose_order(inspection.date_spans_s, warnings)
-    if inspection.time is None and time is None and rate is None:
-        assumed = _assume_rate(inspection, rate_hint, warnings)
-    sampling = (
-        rate
-        or assumed
-        or (1.0 / (time.pace * unit_seconds(time_unit)) if time is not None else inspection.rate_hz)
-    )
-    axes = _guess_axes(inspection, time, reasons)
-    group = list(axes.values())
+        guess.time_unit = _choose_order(inspection.date_spans_s, guess.warnings)
+    if inspection.time is None and guess.time is None and rate is None:
+        guess.rate = _assume_rate(inspection, rate_hint, guess.warnings)
+    guess.sampling_rate_hz = rate or guess.rate or inspection.rate_hz
+    if guess.time is not None and not rate:
+        guess.sampling_rate_hz = 1.0 / (guess.time.pace * unit_seconds(guess.time_unit))
+    _guess_axes(inspection, guess)
     angles = kind == "angle" or any(
-        given_unit(column, "angle") or column.name.lower().startswith("angle_") for column in group
+        given_unit(column, "angle") or column.name.lower().startswith("angle_")
+        for column in guess.group
     )
-    unit = None
-    if not all(given_unit(column, "angle" if angles else "rate") for column in group):
-        usual = sampling if sampling > 0 else TYPICAL_RATE_HZ
-        unit = guess_unit(inspection, axes, usual, reasons, warnings, angles=angles)
-    guessed_kind = _guess_kind(group, reasons, warnings) if angles and kind is None else None
-    if not axes:
-        warnings.append(
+    if not all(given_unit(column, "angle" if angles else "rate") for column in guess.group):
+        guess_unit(inspection, guess, angles=angles)
+    if angles and kind is None:
+        _guess_kind(guess)
+    if not guess.axes:
+        guess.warnings.append(
             "no column looks like a gyro; if one is, name it: --map NAME=gyro_x --unit gyro=deg/s"
         )
-    return Guess(
-        axes,
-        unit,
-        time,
-        time_unit,
-        assumed,
-        _find_temperature(inspection, axes),
-        tuple(reasons),
-        tuple(warnings),
-        sampling,
-        guessed_kind,
-    )
+    guess.temperature = _find_temperature(inspection, guess.axes)
+    return guess
 
 
 def _choose_order(date_spans_s: Mapping[str, float], warnings: list[str]) -> str:
@@ -190,18 +153,20 @@ def _find_temperature(
     return temperatures[0] if len(temperatures) == 1 and not is_named else None
 
 
-def _guess_axes(
-    inspection: FileInspection, time: ColumnInspection | None, reasons: list[str]
-) -> dict[str, ColumnInspection]:
+def _guess_axes(inspection: FileInspection, guess: Guess) -> None:
     gyro_columns = {
         column.name.lower(): column for column in inspection.columns if column.role == "gyro"
     }
     if gyro_columns:
-        return {AXIS_PATTERN.sub(r"\2", name): column for name, column in gyro_columns.items()}
+        guess.axes = {AXIS_PATTERN.sub(r"\2", name): c for name, c in gyro_columns.items()}
+        return
     usable = [
         c
         for c in inspection.columns
-        if c is not time and c.rows >= 0.25 * inspection.rows and c.std > 0 and _may_be_gyro(c)
+        if c is not guess.time
+        and c.rows >= 0.25 * inspection.rows
+        and c.std > 0
+        and _may_be_gyro(c)
     ]
     groups = list(_group_columns(usable))
     steady = [_mean_over_scatter(list(group.values())) for _, group in groups]
@@ -210,20 +175,19 @@ def _guess_axes(
         score = _gyro_score(template, list(group.values()), inspection)
         rivals = [rival for rival in steady if rival is not steadiness]
         if rivals and len(group) == 3:
-            score += (
-                0.75 if steadiness <= min(rivals) else -0.75 if steadiness > max(rivals) else 0.0
-            )  # gravity makes the mean of an accelerometer large
+            # gravity makes the mean of an accelerometer large
+            score += 0.75 * (steadiness <= min(rivals)) - 0.75 * (steadiness > max(rivals))
         if score >= MIN_SCORE and (best is None or score > best[0]):
             best = score, group
     if best is None:
-        return {}
-    names = ", ".join(column.key for column in best[1].values())
+        return
+    guess.axes = best[1]
+    names = ", ".join(column.key for column in guess.group)
     named = _STRONG.search(names.lower()) or any(
         given_unit(column) or name_unit(column, "rate") or INCREMENT_PATTERN.search(column.key)
-        for column in best[1].values()
+        for column in guess.group
     )
-    reasons.append(f"{names}: the gyro, by {'name' if named else 'name and numbers'}")
-    return best[1]
+    guess.reasons.append(f"{names}: the gyro, by {'name' if named else 'name and numbers'}")
 
 
 def _may_be_gyro(column: ColumnInspection) -> bool:
@@ -307,19 +271,21 @@ def _gyro_score(
     return score
 
 
-def _guess_kind(group: Sequence[ColumnInspection], reasons: list[str], warnings: list[str]) -> str:
+def _guess_kind(guess: Guess) -> None:
     """Guess whether angles are cumulative or increments, by their names or steps."""
-    if all(INCREMENT_PATTERN.search(column.key) for column in group):
-        reasons.append("--kind rate, as the columns are increments by name")
-        return "rate"
-    cumulative = all(column.scatter < CUMULATIVE_STEP_SHARE * column.std for column in group)
-    kind, meaning = ("angle", "cumulative") if cumulative else ("rate", "increments of each row")
+    if all(INCREMENT_PATTERN.search(column.key) for column in guess.group):
+        guess.reasons.append("--kind rate, as the columns are increments by name")
+        guess.kind = "rate"
+        return
+    cumulative = all(c.scatter < CUMULATIVE_STEP_SHARE * c.std for c in guess.group)
+    guess.kind, meaning = (
+        ("angle", "cumulative") if cumulative else ("rate", "increments of each row")
+    )
     alternative = "rate if they are increments" if cumulative else "angle if they are cumulative"
-    warnings.append(
-        f"--kind {kind}, {meaning}, is a guess from the size of the steps between rows; give "
+    guess.warnings.append(
+        f"--kind {guess.kind}, {meaning}, is a guess from the size of the steps between rows; give "
         f"--kind {alternative}"
     )
-    return kind
 
 
 def _mean_over_scatter(group: Sequence[ColumnInspection]) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -51,6 +51,33 @@ _EPOCH_S = 1e9
 _SERIAL_DAYS = {"days since 1899-12-30": (25_000.0, 80_000.0), DATENUM: (718_960.0, 773_960.0)}
 
 
+@dataclass
+class Guess:
+    """Guessed roles of the columns of a file, with the reasons.
+
+    `axes` are the columns of the gyro by axis (empty if no column looks like one); `unit` is the
+    unit to give for them, None if they carry one; `time` and `time_unit` likewise (of dates, the
+    order of day and month); `kind` is the kind to give for angles; `rate` [Hz] is set for a file
+    without time. `sampling_rate_hz` is the rate that the guess is based on.
+    """
+
+    axes: dict[str, ColumnInspection] = field(default_factory=dict)
+    unit: str | None = None
+    time: ColumnInspection | None = None
+    time_unit: str | None = None
+    rate: float | None = None
+    temperature: ColumnInspection | None = None
+    reasons: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    sampling_rate_hz: float = math.nan
+    kind: str | None = None
+
+    @property
+    def group(self) -> list[ColumnInspection]:
+        """Columns of the gyro."""
+        return list(self.axes.values())
+
+
 def given_unit(column: ColumnInspection, quantity: str = "rate") -> bool:
     """Return whether the header gives a unit of rates, or of another quantity."""
     return is_unit_of(column.unit, (quantity,))
@@ -77,28 +104,22 @@ def temperature_unit(column: ColumnInspection) -> str:
     return str(column.unit if has_unit else name_unit(column, "temperature") or "degC")
 
 
-def guess_unit(
-    inspection: FileInspection,
-    axes: dict[str, ColumnInspection],
-    rate: float,
-    reasons: list[str],
-    warnings: list[str],
-    *,
-    angles: bool,
-) -> str:
+def guess_unit(inspection: FileInspection, guess: Guess, *, angles: bool) -> None:
     """Guess the unit of the gyro columns, and add the reasons and warnings.
 
     A unit in the header that is not known leaves the guess to names and numbers.
     """
-    group = list(axes.values())
+    group, warnings = guess.group, guess.warnings
     for column in group:
         in_header = given_unit(column)
         named = column.unit if in_header else name_unit(column, "rate")
         if named is None and not angles and (angle := name_unit(column, "angle")):
             named = f"{angle}/s"
         if named is not None and is_unit_of(named, ("rate",)):
-            reasons.append(f"unit {named}, by {'that of another axis' if in_header else 'name'}")
-            return named
+            by = "that of another axis" if in_header else "name"
+            guess.reasons.append(f"unit {named}, by {by}")
+            guess.unit = named
+            return
     units = {
         unit: is_unit(unit) or is_unit_of(unit, ("number",)) or _names_counts(unit)
         for unit in (column.unit for column in group)
@@ -114,14 +135,17 @@ def guess_unit(
             "the file states no known unit of the angles; deg is an assumption, put the true one "
             "in its place"
         )
-        return "deg"
+        guess.unit = "deg"
+        return
     counts = any(units.values()) or any(_names_counts(column.key) for column in group)
     large = (
         inspection.summary.format == "miniseed"
         and max(max(abs(c.low), abs(c.high)) for c in group) > 10.0
     )
     if counts or large or all(c.whole for c in group):
-        return _scale_of_counts(group, reasons, warnings)
+        guess.unit = _scale_of_counts(guess)
+        return
+    rate = guess.sampling_rate_hz if guess.sampling_rate_hz > 0 else TYPICAL_RATE_HZ
     means = np.array([c.mean for c in group])
     scatter = float(np.median([c.scatter for c in group]))
     top = max(max(abs(c.low), abs(c.high)) for c in group)
@@ -131,8 +155,8 @@ def guess_unit(
     }
     unit = max(scores, key=lambda unit: scores[unit])
     factor = parse_unit(unit).factor
-    walk = scatter * factor / (60.0 * math.sqrt(rate)) if rate > 0 else math.nan
-    reasons.append(
+    walk = scatter * factor / (60.0 * math.sqrt(rate))
+    guess.reasons.append(
         f"unit {unit}, by the noise: {walk:.2g} deg/sqrt(h); the mean is "
         f"{np.linalg.norm(means) * factor:.4g} deg/h"
     )
@@ -140,7 +164,7 @@ def guess_unit(
         f"the unit {unit} is a guess from the numbers, as the file states no known unit; check it "
         "with the data sheet"
     )
-    return unit
+    guess.unit = unit
 
 
 def _names_counts(text: str) -> bool:
@@ -167,12 +191,10 @@ def rate_plausibility(
     return score
 
 
-def _scale_of_counts(
-    group: Sequence[ColumnInspection], reasons: list[str], warnings: list[str]
-) -> str:
+def _scale_of_counts(guess: Guess) -> str:
     """Return a provisional unit for counts, whose scale the file does not contain."""
-    norm = math.hypot(*(c.mean for c in group))
-    if len(group) == 3 and norm > 0:
+    norm = math.hypot(*(column.mean for column in guess.group))
+    if len(guess.axes) == 3 and norm > 0:
         per_count = EARTH_RATE_DPH / norm  # deg/h = arcsec/s
         decade = 10.0 ** math.floor(math.log10(per_count))
         round_one = min(
@@ -180,11 +202,11 @@ def _scale_of_counts(
             key=lambda scale: abs(math.log(scale / per_count)),
         )
         if abs(round_one / per_count - 1) < EARTH_TOLERANCE:
-            reasons.append(
+            guess.reasons.append(
                 f"{round_one:g} arcsec/s a count, as the mean of the three axes is then the "
                 "rotation of the Earth"
             )
-            warnings.append(
+            guess.warnings.append(
                 f"the scale of {round_one:g} arcsec/s a count is a guess; put that of the data "
                 "sheet in its place"
             )
@@ -193,11 +215,11 @@ def _scale_of_counts(
     exponent = math.floor(math.log10(earth / norm)) if norm > 0 else -9
     unit = "nrad/s" if exponent == -9 else f"1e{exponent:d} rad/s"
     text = f"1 {unit}" if unit == "nrad/s" else unit
-    reasons.append(
+    guess.reasons.append(
         f"{text} a count is the largest decimal scale at which the mean is not more than the "
         "rotation of the Earth"
     )
-    warnings.append(
+    guess.warnings.append(
         "the columns are counts, and the file does not give their scale: replace "
         f"{text} with the scale of the data sheet"
     )
@@ -225,10 +247,8 @@ def rises_by_row(column: ColumnInspection, inspection: FileInspection) -> bool:
     )
 
 
-def guess_time(
-    inspection: FileInspection, reasons: list[str], warnings: list[str]
-) -> tuple[ColumnInspection | None, str | None]:
-    """Guess the time column and its unit, and add the reasons and warnings; None without one."""
+def guess_time(inspection: FileInspection, guess: Guess) -> None:
+    """Guess the time column and its unit, if there is one, and add the reasons and warnings."""
     best: tuple[float, ColumnInspection, str, str] | None = None
     for column in inspection.columns:
         if not rises_by_row(column, inspection):
@@ -249,17 +269,17 @@ def guess_time(
         if best is None or score > best[0]:
             best = score, column, unit, reason
     if best is None:
-        return None, None
+        return
     _, column, unit, reason = best
-    reasons.append(
+    guess.time, guess.time_unit = column, unit
+    guess.reasons.append(
         f"{column.key!r} is the time, as it rises from row to row; in {unit}, by {reason}"
     )
     if reason.startswith("the rate"):
-        warnings.append(
+        guess.warnings.append(
             f'--unit "time={unit}" is an assumption, because of {reason}: if that is not the '
             "sampling rate, use the true unit instead"
         )
-    return column, unit
 
 
 def _time_unit(column: ColumnInspection) -> tuple[str, str]:

@@ -44,18 +44,18 @@ class ColumnInspection(ColumnSummary):
     the number of filled rows a second, NaN if the time is unknown.
     """
 
-    rows: int
-    low: float
-    high: float
-    mean: float
-    std: float
-    scatter: float
-    held: float
-    rising: float
-    whole: bool
-    first: float
-    pace: float
-    rate_hz: float
+    rows: int = 0
+    low: float = math.nan
+    high: float = math.nan
+    mean: float = math.nan
+    std: float = math.nan
+    scatter: float = math.nan
+    held: float = 0.0
+    rising: float = 0.0
+    whole: bool = False
+    first: float = math.nan
+    pace: float = math.nan
+    rate_hz: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -203,25 +203,23 @@ def _inspect_column(
         sums = away.sum(), (away**2).sum(), scatter
         chunks.append((first, values.min(), values.max(), *sums, *counts))
         paces += _mean_steps(values)
-    table = np.array(chunks, dtype=np.float64).reshape(-1, 11)
-    has_values = len(table) > 0
+    described = ColumnInspection(**{**vars(column), "key": column.key or column.header})
+    if not chunks:
+        return replace(described, rate_hz=0.0 * row_rate_hz)
+    table = np.array(chunks, dtype=np.float64)
     total, squares, scatters, rows, steps_seen, wholes, held, rising = table[:, 3:].sum(axis=0)
-    ends = (table[0, 0], table[:, 1].min(), table[:, 2].max()) if has_values else ()
-    first, low, high = ends or (math.nan,) * 3
-    variance = max(0.0, squares / rows - (total / rows) ** 2) if has_values else math.nan
-    size = log[name].size if name in log.data_vars else log.sizes.get("row", 1)
-    return ColumnInspection(
-        **{**vars(column), "key": column.key or column.header},
+    return replace(
+        described,
         rows=int(rows),
-        low=float(low),
-        high=float(high),
-        mean=float(table[0, 0] + total / rows) if has_values else math.nan,
-        std=math.sqrt(variance),
+        low=float(table[:, 1].min()),
+        high=float(table[:, 2].max()),
+        mean=float(table[0, 0] + total / rows),
+        std=math.sqrt(max(0.0, squares / rows - (total / rows) ** 2)),
         scatter=float(scatters / steps_seen) if steps_seen else math.nan,
         held=float(held / max(1, steps_seen)),
         rising=float(rising / max(1, steps_seen)),
-        whole=bool(rows > 0 and wholes > WHOLE_SHARE * rows),
-        first=float(first),
+        whole=bool(wholes > WHOLE_SHARE * rows),
+        first=float(table[0, 0]),
         pace=float(np.median(paces)) if paces else math.nan,
-        rate_hz=row_rate_hz * float(rows) / max(1, size),
+        rate_hz=row_rate_hz * float(rows) / log[name].size,
     )

@@ -39,7 +39,7 @@ class ReadOptions:
     map: Mapping[str, str] = field(default_factory=dict)
     unit: Mapping[str, str] = field(default_factory=dict)
     kind: str | None = None
-    channel: Sequence[str | Path] = ()
+    channel: str | Path | Sequence[str | Path] = ()
     channels_only: bool = False
     growing: bool = False
     strict: bool = False
@@ -65,8 +65,6 @@ class ReadOptions:
             object.__setattr__(self, name, given)
         object.__setattr__(self, "limits", check_limits(self.limits))
         object.__setattr__(self, "channel", self.channel or ())
-        if isinstance(self.channel, str | Path):
-            object.__setattr__(self, "channel", (self.channel,))
 
     @property
     def epoch_ns(self) -> int:

@@ -7,7 +7,6 @@ import errno
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
 
 import xarray as xr
 
@@ -133,7 +132,7 @@ def read_log(
         map=map or {},
         unit=unit or {},
         kind=kind,
-        channel=cast(Any, channel),
+        channel=channel,
         strict=strict,
         limits=limits or {},
     )

@@ -20,8 +20,8 @@ from gyrostab.ingest.formats.text import read_head
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.ingest.grid.scan_pass import find_spans
-from gyrostab.ingest.guess import Guess, guess_columns
-from gyrostab.ingest.guess_unit import temperature_unit
+from gyrostab.ingest.guess import guess_columns
+from gyrostab.ingest.guess_unit import Guess, temperature_unit
 from gyrostab.ingest.inspect import FileInspection, inspect_file
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.ingest.reading import read_log
@@ -265,15 +265,8 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
     reading = _select_reading(reading)
     summary = scan_file(path, ReadOptions(**reading))
     raw = read_log([path], **reading)
-    regular = "sampling_rate_hz" in raw.attrs  # a log that gyrostab wrote
-    log = (
-        raw
-        if regular
-        else regularise(
-            raw, rate=reading.get("rate"), max_gap=max_gap, limits=reading.get("limits")
-        )
-    )
-    log = cut_log(log, **cut)
+    placing = {"rate": reading.get("rate"), "max_gap": max_gap, "limits": reading.get("limits")}
+    log = cut_log(regularise(raw, **placing), **cut)
     start, end = pd.DatetimeIndex(log["time"][[0, -1]].values)
     signal = log[signal_name(log)]
     notes = dict.fromkeys(
@@ -288,7 +281,7 @@ def _scan_one(path: Path, reading: dict[str, Any]) -> dict[str, Any]:
         "rate_hz": float(log.attrs["sampling_rate_hz"]),
         "axes": " ".join(map(str, log["axis"].values)),
         "channels": " ".join(log_channels(log)),
-        "rows": int(raw.sizes["time" if regular else "row"]),
+        "rows": int(raw.sizes["row" if "row" in raw.sizes else "time"]),
         "gaps": len(gap_table(log))
         if "gap_start" in log.variables
         else len(find_spans(signal.isnull().all("axis").values, 0)),

@@ -212,8 +212,10 @@ class Converted(Source):
         return self.convert(read_box(self.parts[0], box if isinstance(box, tuple) else (box,)))
 
 
-def convert_lazy(array: Any, convert: Callable[[Array], Array], dtype: Any) -> Any:
-    """Return a dask array of converted values; a source can still be read."""
+def convert_values(array: Any, convert: Callable[[Array], Array], dtype: Any) -> Any:
+    """Return converted values, in dask if the array is; a source can still be read."""
+    if not hasattr(array, "dask"):
+        return convert(array)
     if find_source(array) is not None:
         return make_dask(Converted(array, convert, dtype), array.chunks)
     return array.map_blocks(convert, dtype=dtype, meta=np.empty((0,) * array.ndim, dtype))
@@ -232,7 +234,7 @@ def fill_masked(array: Any) -> Any:
     if array.dtype.kind != "f":
         array = array.astype(np.float64)
     return (
-        convert_lazy(array, fill_masked, array.dtype)
+        convert_values(array, fill_masked, array.dtype)
         if hasattr(array, "dask")
         else array.filled(np.nan)
     )
@@ -244,7 +246,7 @@ def hide_infinite(array: Any) -> Any:
     if array.dtype.kind != "f":
         return array
     if hasattr(array, "dask"):
-        return convert_lazy(array, hide_infinite, array.dtype)
+        return convert_values(array, hide_infinite, array.dtype)
     infinite = np.isinf(array)
     return np.where(infinite, array.dtype.type(np.nan), array) if infinite.any() else array
 

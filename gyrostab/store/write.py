@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from gyrostab.arrays import Array, Floats
 from gyrostab.kernels.encoding.counts import to_counts
 from gyrostab.store.layout import find_hdf5_codecs
-from gyrostab.store.lazy import convert_lazy, find_source, read_box
+from gyrostab.store.lazy import convert_values, find_source, read_box
 from gyrostab.store.private import library_lock
 from gyrostab.store.threads import MAX_WORKERS, map_in_order
 
@@ -77,8 +77,7 @@ def as_counts(name: str, variable: xr.Variable) -> xr.Variable:
         return xr.Variable(variable.dims, variable.data, variable.attrs)
     dtype = "int16" if declared.itemsize == 1 or declared == np.int16 else "int32"
     pack = partial(_pack_counts, name=name, scale=float(scale), dtype=dtype)
-    data = variable.data
-    packed = pack(data) if variable.chunks is None else convert_lazy(data, pack, dtype)
+    packed = convert_values(variable.data, pack, dtype)
     return xr.Variable(
         variable.dims,
         packed,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -63,57 +63,22 @@ RISES_OF_STAMPS = 9
 TEMPERATURE_PATTERN = re.compile(r"temp|(^|[^a-z])tmp")
 
 
-@dataclass(frozen=True)
+@dataclass
 class FileColumn:
-    """A column as its format describes it."""
+    """A column as its format describes it, and the name that it gets."""
 
     header: str  # as written, or "0", "1", ... in a file without a header
-    unit: str | None = None  # that the format stores outside the header
+    stored: str | None = None  # unit that the format stores outside the header
     calendar: str | None = None  # the CF calendar of that unit
     stamped: bool = False  # holds dates (text, datetime types)
     date_order: str | None = YEAR_FIRST  # of these dates; None if they can be read in two ways
     target: str | None = None  # by a code of the format, in the form of --map, which overrules it
     cells: Sequence[str] = ()  # the first ones, with decimal points; empty if they are not known
-
-    @property
-    def is_filled(self) -> bool:
-        """Whether any of the first cells is filled, as far as they are known."""
-        return not self.cells or any(cell.strip().lower() not in VOID_CELLS for cell in self.cells)
-
-    @property
-    def first_word(self) -> str:
-        """The first cell that holds no number, cut to 60 characters; empty without one."""
-        cells = (cell.strip()[:60] for cell in self.cells)
-        return next((c for c in cells if c.lower() not in VOID_CELLS and not is_number(c)), "")
-
-    @property
-    def is_rising(self) -> bool:
-        """Whether the first filled cells rise from row to row, as stamps do."""
-        cells = [cell for cell in self.cells if cell.strip()]
-        if all(map(is_number, cells)):
-            steps = np.diff([float(plain_number(cell)) for cell in cells])
-        else:
-            order = find_order(cells) or DAY_FIRST
-            if order == NAMED_ZONE:
-                return True
-            if order == NO_DATE:
-                cells = [f"1970-01-01 {cell}" for cell in cells]
-            stamps = cells_to_ns(cells, None, 0, order)
-            steps = np.diff(stamps[stamps != NAT])
-        return int((steps > 0).sum()) > RISES_OF_STAMPS * int((steps < 0).sum())
-
-
-@dataclass
-class Header:
-    """A column whose role is being determined."""
-
-    source: int
-    header: str
-    name: str
-    unit: str | None
-    file: FileColumn  # as its format describes it
-    stored: str | None  # unit that the format stores outside the header; --unit overrules it
-    key: str  # unique name for --map
+    # from here on by `distinct_columns` and `name_columns`
+    source: int = 0  # number of the column in the file
+    name: str = ""
+    unit: str | None = None  # in the header, or of --map
+    key: str = ""  # unique name for --map
     mapped: bool = False  # named by --map
     preset: bool = False  # named by the preset of the program that wrote the file
 
@@ -133,9 +98,33 @@ class Header:
         return self.mapped or self.preset
 
     @property
+    def is_filled(self) -> bool:
+        """Whether any of the first cells is filled, as far as they are known."""
+        return not self.cells or any(cell.strip().lower() not in VOID_CELLS for cell in self.cells)
+
+    @property
+    def first_word(self) -> str:
+        """The first cell that holds no number, cut to 60 characters; empty without one."""
+        cells = (cell.strip()[:60] for cell in self.cells)
+        return next((c for c in cells if c.lower() not in VOID_CELLS and not is_number(c)), "")
+
+    @property
     def may_rise(self) -> bool:
-        """Whether the first cells rise, as far as they are known."""
-        return not self.file.cells or self.file.is_rising
+        """Whether the first filled cells, if they are known, rise from row to row as stamps do."""
+        if not self.cells:
+            return True
+        cells = [cell for cell in self.cells if cell.strip()]
+        if all(map(is_number, cells)):
+            steps = np.diff([float(plain_number(cell)) for cell in cells])
+        else:
+            order = find_order(cells) or DAY_FIRST
+            if order == NAMED_ZONE:
+                return True
+            if order == NO_DATE:
+                cells = [f"1970-01-01 {cell}" for cell in cells]
+            stamps = cells_to_ns(cells, None, 0, order)
+            steps = np.diff(stamps[stamps != NAT])
+        return int((steps > 0).sum()) > RISES_OF_STAMPS * int((steps < 0).sum())
 
 
 def split_header(text: str) -> tuple[str, str | None]:
@@ -204,7 +193,7 @@ def time_suffix(name: str) -> str | None:
     return next((text for text in match.groups() if text), None) if match else None
 
 
-def distinct_columns(columns: Sequence[FileColumn]) -> Iterator[Header]:
+def distinct_columns(columns: Sequence[FileColumn]) -> Iterator[FileColumn]:
     """Yield the columns, each with a unique key: name, header or numbered name."""
     split = [(column.header.strip(), *split_header(column.header)) for column in columns]
     names = Counter(name.lower() for _, name, _ in split)
@@ -218,8 +207,7 @@ def distinct_columns(columns: Sequence[FileColumn]) -> Iterator[Header]:
             number = counts[key.lower()]
             key = key if number == 1 else free_name(f"{name}_", used_names, number)
             used_names.add(key.lower())
-        column = columns[source]
-        yield Header(source, header, name, unit, column, column.unit, key)
+        yield replace(columns[source], header=header, source=source, name=name, unit=unit, key=key)
 
 
 def free_name(stem: str, used_names: Collection[str], number: int = 2) -> str:
@@ -242,7 +230,7 @@ def example_unit(quantity: str | None) -> str:
     return "1" if quantity is None else known_units(quantity).split(",")[0]
 
 
-def channel_name(column: Header) -> str:
+def channel_name(column: FileColumn) -> str:
     """Return the name of a column as a channel, without blanks and slashes."""
     return re.sub(r"[/\s]+", "_", column.low if quantity_of(column.low) else column.name)
 

@@ -23,7 +23,6 @@ from gyrostab.ingest.columns.dates import YEAR_FIRST
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     FileColumn,
-    Header,
     channel_name,
     distinct_columns,
     free_name,
@@ -104,7 +103,7 @@ class Plan:
 
     def find_unit(
         self,
-        column: Header,
+        column: FileColumn,
         keys: list[str],
         written: str | None,
         usable: Callable[[str], bool],
@@ -138,17 +137,17 @@ class Plan:
         """Add a problem, which prevents reading; the name of the file is put in front."""
         self.problems.append(error(f"{self.path.name}: {problem}"))
 
-    def leave_out(self, column: Header) -> None:
+    def leave_out(self, column: FileColumn) -> None:
         """Add the summary of a column that is left out."""
         self.add_summary(column, column.name, "left out", column.written)
 
-    def add_column(self, column: Header, text: str | None, planned: Column) -> None:
+    def add_column(self, column: FileColumn, text: str | None, planned: Column) -> None:
         """Add a column to read, with the unit that the file or the user gives it."""
         self.columns.append(planned)
         name = column.low if planned.role == "gyro" else planned.name
         self.add_summary(column, name, planned.role, text)
 
-    def add_summary(self, column: Header, name: str, role: str, unit: str | None) -> None:
+    def add_summary(self, column: FileColumn, name: str, role: str, unit: str | None) -> None:
         """Add the summary of a column."""
         self.summaries.append(ColumnSummary(column.header, name, role, unit, column.key))
 
@@ -167,7 +166,7 @@ def describe_left_out(reason: str, names: Sequence[str], advice: str = "") -> li
 
 def name_columns(
     plan: Plan, columns: Sequence[FileColumn], presets: Mapping[int, str]
-) -> list[Header]:
+) -> list[FileColumn]:
     """Name the columns by ``--map``, then by the preset, and drop those that either drops."""
     headers = list(distinct_columns(columns))
     exact_keys = {key.strip(): key for key in plan.options.map}
@@ -175,7 +174,7 @@ def name_columns(
     keys_by_name = {key.lower(): exact_keys[key] for key in exact_keys if key not in names}
     targets = {split_header(target)[0].lower() for target in plan.options.map.values()}
     are_axes_given = any(map(AXIS_PATTERN.match, targets))  # then the preset names none
-    named: list[Header] = []
+    named: list[FileColumn] = []
     for column in headers:
         texts = (column.key, column.header, column.name)
         keys = (exact_keys.get(text, keys_by_name.get(text.lower())) for text in texts)
@@ -186,7 +185,7 @@ def name_columns(
             if target in ("", "-"):
                 continue
             column.name, column.unit, column.mapped = target, target_unit or column.unit, True
-        elif preset := presets.get(column.source, columns[column.source].target):
+        elif preset := presets.get(column.source, column.target):
             target, target_unit = split_header(preset)
             is_axis = bool(AXIS_PATTERN.match(target.lower()))
             if target == "-" or target.lower() in targets or (is_axis and are_axes_given):
@@ -200,9 +199,9 @@ def name_columns(
     return named
 
 
-def resolve_duplicates(plan: Plan, named: list[Header]) -> list[Header]:
+def resolve_duplicates(plan: Plan, named: list[FileColumn]) -> list[FileColumn]:
     """Give columns of one name different names; an axis must be one column."""
-    groups: dict[str, list[Header]] = {}
+    groups: dict[str, list[FileColumn]] = {}
     for column in named:
         axis = AXIS_PATTERN.match(column.low)
         channel = "time" if column.low == "time" else stored_name(channel_name(column))

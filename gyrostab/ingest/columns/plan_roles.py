@@ -18,7 +18,6 @@ from gyrostab.ingest.columns.headers import (
     TEMPERATURE_PATTERN,
     TIME_PATTERN,
     FileColumn,
-    Header,
     channel_name,
     distinct_columns,
     example_unit,
@@ -93,7 +92,7 @@ def plan_columns(
     return plan
 
 
-def _plan_gyro(plan: Plan, gyro: list[Header], columns: Sequence[FileColumn]) -> None:
+def _plan_gyro(plan: Plan, gyro: list[FileColumn], columns: Sequence[FileColumn]) -> None:
     """Plan the gyro axes, with signal and kind (rates, increments or cumulative angles)."""
     if plan.options.channels_only:
         for column in gyro:
@@ -123,7 +122,7 @@ def _plan_gyro(plan: Plan, gyro: list[Header], columns: Sequence[FileColumn]) ->
         plan.kind = _find_kind(plan, first.header, first.key, first.low)
 
 
-def _plan_axis(plan: Plan, column: Header) -> str | None:
+def _plan_axis(plan: Plan, column: FileColumn) -> str | None:
     match = AXIS_PATTERN.match(column.low)
     assert match is not None
     stem, axis = match.groups()
@@ -195,7 +194,7 @@ def _find_kind(plan: Plan, header: str, key: str, name: str) -> str:
     return "angle" if plan.options.kind == "angle" else "increment"
 
 
-def _plan_channels(plan: Plan, rest: list[Header]) -> None:
+def _plan_channels(plan: Plan, rest: list[FileColumn]) -> None:
     """Plan the channels: those with a unit are kept, others left out with a note or refused."""
     _note_temperatures(plan, rest)
     limits, others = plan.options.limits, len(plan.columns)  # time and gyro
@@ -247,7 +246,7 @@ def _plan_channels(plan: Plan, rest: list[Header]) -> None:
     plan.notes += describe_left_out(reason, left_out["limit"], advice)
 
 
-def _note_temperatures(plan: Plan, rest: list[Header]) -> None:
+def _note_temperatures(plan: Plan, rest: list[FileColumn]) -> None:
     """Note which columns could be the temperature of the gyro, unless one is named so."""
     options = plan.options
     is_named = any(quantity_of(column.low) == "temperature" for column in rest)
@@ -269,7 +268,7 @@ def _note_temperatures(plan: Plan, rest: list[Header]) -> None:
 
 def _plan_channel(
     plan: Plan,
-    column: Header,
+    column: FileColumn,
     name: str,
     quantity: str | None,
     text: str,
@@ -322,7 +321,7 @@ def _describe_lack(path: Path, columns: Sequence[FileColumn]) -> str:
     )
 
 
-def _axis_options(column: Header) -> str:
+def _axis_options(column: FileColumn) -> str:
     """Return the options that a column needs as a gyro axis, with a blank in front."""
     if column.unit and is_unit_of(column.unit, ("rate",)):
         return ""
@@ -334,11 +333,11 @@ def _axis_options(column: Header) -> str:
     return f" --unit gyro={'rad/s' if 'rad' in low else 'deg/s'}"
 
 
-def _may_be_axis(column: Header) -> bool:
+def _may_be_axis(column: FileColumn) -> bool:
     """Return whether unit and values of a column allow a gyro axis."""
     unit = column.written or "1"
     has_other_unit = is_unit(unit) and not is_unit_of(unit, ("rate", "angle", "number"))
-    return not (has_other_unit or column.file.stamped)
+    return not (has_other_unit or column.stamped)
 
 
 def scan_advice(path: Path) -> str:

@@ -22,7 +22,7 @@ from gyrostab.ingest.columns.headers import (
     KNOWN_CHANNEL_PATTERN,
     TIME_PATTERN,
     VOID_CELLS,
-    Header,
+    FileColumn,
     is_time_unit,
     split_header,
     time_suffix,
@@ -34,7 +34,7 @@ from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_uni
 UNREADABLE = (NO_DATE, NAMED_ZONE)
 
 
-def find_time(plan: Plan, named: list[Header]) -> Header | None:
+def find_time(plan: Plan, named: list[FileColumn]) -> FileColumn | None:
     """Choose the time column and its unit; other candidates are left out with a note."""
     time_columns = _find_by_name(named) or _find_by_content(plan, named)
     if not time_columns:
@@ -50,15 +50,17 @@ def find_time(plan: Plan, named: list[Header]) -> Header | None:
         for rival in rivals:
             plan.leave_out(rival)
         named[:] = [c for c in named if c not in rivals]
-    unit = None if column.file.stamped else _time_unit(plan, column)
-    order = _date_order(plan, column) if column.file.stamped else YEAR_FIRST
-    epoch = -_find_offset(plan, column, named) if column.file.stamped else plan.options.epoch_ns
-    planned = column.source, column.header, "time", "time", "ns"
-    plan.columns.append(Column(*planned, time_unit=unit, date_order=order, epoch=epoch))
-    written = unit.text if unit else None
-    if column.file.stamped:
-        written = "ISO 8601" if order == YEAR_FIRST else order
-    plan.add_summary(column, "time", "time", written)
+    if column.stamped:
+        unit, order = None, _date_order(plan, column)
+        epoch = -_find_offset(plan, column, named)
+        written: str | None = "ISO 8601" if order == YEAR_FIRST else order
+    else:
+        unit, order, epoch = _time_unit(plan, column), YEAR_FIRST, plan.options.epoch_ns
+        written = unit.text if unit else None
+    planned = Column(
+        column.source, column.header, "time", "time", "ns", 1.0, 0.0, unit, order, epoch
+    )
+    plan.add_column(column, written, planned)
     if (
         unit is not None
         and unit.epoch is None
@@ -75,25 +77,25 @@ def find_time(plan: Plan, named: list[Header]) -> Header | None:
     return column
 
 
-def _find_by_name(named: Sequence[Header]) -> list[Header]:
+def _find_by_name(named: Sequence[FileColumn]) -> list[FileColumn]:
     """Find the columns that are called time: by ``--map``, else by the preset, else in the file."""
     called = [c for c in named if c.low == "time" and c.is_named]
     if called:
         return [c for c in called if c.mapped] or called
     likely = [c for c in named if not c.is_named and TIME_PATTERN.match(c.low) and _may_be_time(c)]
-    return [c for c in likely if c.low != "t" or c.written or c.file.stamped] or likely
+    return [c for c in likely if c.low != "t" or c.written or c.stamped] or likely
 
 
-def _find_by_content(plan: Plan, named: Sequence[Header]) -> list[Header]:
+def _find_by_content(plan: Plan, named: Sequence[FileColumn]) -> list[FileColumn]:
     """Find the columns of dates, else the only column that rises in a unit of time, with a note."""
     can_leave_out = plan.options.rate is not None
     candidates = [
         c
         for c in named
-        if c.file.stamped
+        if c.stamped
         and c.may_rise
         and not c.is_named
-        and not (can_leave_out and c.file.date_order in UNREADABLE)
+        and not (can_leave_out and c.date_order in UNREADABLE)
     ]
     reason = "it holds dates"
     if not candidates:
@@ -105,33 +107,33 @@ def _find_by_content(plan: Plan, named: Sequence[Header]) -> list[Header]:
     return candidates
 
 
-def _may_be_time(column: Header) -> bool:
+def _may_be_time(column: FileColumn) -> bool:
     # An epoch that cannot be read is reported, not ignored.
-    return column.written is None or column.file.stamped or _counts_time(column.written)
+    return column.written is None or column.stamped or _counts_time(column.written)
 
 
 def _counts_time(unit: str) -> bool:
     return is_time_unit(unit) or names_epoch(unit)
 
 
-def _is_clock(column: Header) -> bool:
+def _is_clock(column: FileColumn) -> bool:
     """Return whether a column of another name has a unit of time, and values known to rise."""
     return (
         column.written is not None
         and _counts_time(column.written)
         and not column.is_named
         and not KNOWN_CHANNEL_PATTERN.match(column.low)
-        and bool(column.file.cells)
-        and column.file.is_rising
+        and bool(column.cells)
+        and column.may_rise
     )
 
 
-def _date_order(plan: Plan, column: Header) -> str:
+def _date_order(plan: Plan, column: FileColumn) -> str:
     """Return the order of day, month and year: from the user, the header, or the dates."""
-    if column.file.date_order == NAMED_ZONE:
+    if column.date_order == NAMED_ZONE:
         plan.refuse(
             UnitError,
-            f"the time column {column.header!r} holds {column.file.first_word!r}, with the "
+            f"the time column {column.header!r} holds {column.first_word!r}, with the "
             "name of a time zone; write the offset from UTC in its place, for instance "
             "2026-05-01T08:00:00-06:00 or 05/20/2026 8:00:00 AM -06:00",
         )
@@ -141,7 +143,7 @@ def _date_order(plan: Plan, column: Header) -> str:
         if order := parse_order(plan.options.unit[key]):
             plan.used_units.add(key)
             return order
-    order = parse_order(column.written or "") or column.file.date_order
+    order = parse_order(column.written or "") or column.date_order
     if order == NO_DATE:
         plan.refuse(
             UnitError,
@@ -158,13 +160,13 @@ def _date_order(plan: Plan, column: Header) -> str:
     return order or EITHER_FIRST
 
 
-def _find_offset(plan: Plan, column: Header, named: Sequence[Header]) -> int:
+def _find_offset(plan: Plan, column: FileColumn, named: Sequence[FileColumn]) -> int:
     """Return the offset from UTC of dates without one [ns]: from the user or the header.
 
     A column that gives the zone of each row may change later in the file, and times may be in UTC
     in spite of it: the user has to say what they are.
     """
-    cells = column.file.cells
+    cells = column.cells
     if not cells or any(map(has_offset, cells)):
         return 0
     key = plan.unit_key([column.name, column.key, column.header, "time"])
@@ -196,9 +198,9 @@ def _find_offset(plan: Plan, column: Header, named: Sequence[Header]) -> int:
     return offset or 0
 
 
-def _find_zone_cell(named: Sequence[Header]) -> tuple[str, str] | None:
+def _find_zone_cell(named: Sequence[FileColumn]) -> tuple[str, str] | None:
     """Find the first cell that gives another time zone than UTC, with the header of its column."""
-    cells = ((column, cell.strip()) for column in named for cell in column.file.cells)
+    cells = ((column, cell.strip()) for column in named for cell in column.cells)
     zones = (
         (column.header, cell)
         for column, cell in cells
@@ -207,7 +209,7 @@ def _find_zone_cell(named: Sequence[Header]) -> tuple[str, str] | None:
     return next(zones, None)
 
 
-def _time_unit(plan: Plan, column: Header) -> TimeUnit | None:
+def _time_unit(plan: Plan, column: FileColumn) -> TimeUnit | None:
     named = time_suffix(split_header(column.header)[0])
     written = column.unit or (
         named if named not in ("utc", "iso") and column.stored is None else None
@@ -215,7 +217,7 @@ def _time_unit(plan: Plan, column: Header) -> TimeUnit | None:
     keys = [column.name, column.key, column.header, "time"]
     text = plan.find_unit(column, keys, written, is_time_unit, prefer_given=column.unit is None)
     if text is None:
-        word = column.file.first_word
+        word = column.first_word
         plan.refuse(
             MissingUnitError,
             f"the time column {column.header!r} holds {word!r}, which is neither a number nor a "
@@ -228,7 +230,7 @@ def _time_unit(plan: Plan, column: Header) -> TimeUnit | None:
         )
         return None
     try:
-        return parse_time_unit(text, column.file.calendar if text == column.stored else None)
+        return parse_time_unit(text, column.calendar if text == column.stored else None)
     except GyrostabError as error:
         advice = '"time=seconds since 2026-01-02T00:00:00"' if names_epoch(text) else "time=s"
         plan.refuse(

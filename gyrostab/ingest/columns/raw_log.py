@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Buffers, find_even
+from gyrostab.ingest.columns.pieces import Buffers, find_even
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.stamps import DATENUM, NAT, TurningClock
 from gyrostab.ingest.options import FileSummary
 from gyrostab.schema import SIGNAL_UNITS
-from gyrostab.store.lazy import Converted, make_dask, read_slice, stack_rows
+from gyrostab.store.lazy import convert_values, read_slice, stack_rows
 from gyrostab.store.write import pack_counts
 from gyrostab.units import DAY
 
@@ -61,6 +61,34 @@ class ConvertedBlock(NamedTuple):
     cells: int
 
 
+@dataclass
+class _Statistics:
+    """What the blocks of a column held so far."""
+
+    column: Column
+    missing: int = 0
+    is_whole: bool = True  # whether all numbers are whole, in the unit of the file
+    reach: float = 0.0  # largest magnitude in that unit
+    #: Extremes in the inner unit, with their rows.
+    lowest: tuple[float, int] = (np.inf, 0)
+    highest: tuple[float, int] = (-np.inf, 0)
+
+    def add(
+        self, cells: Floats, first: int, missing: int, low: float, high: float, is_whole: bool
+    ) -> None:
+        """Add a block from row `first` on, with the findings of `clean_column`."""
+        self.missing += missing
+        if missing == cells.size:
+            return
+        self.is_whole &= is_whole
+        self.reach = max(self.reach, -low, high)
+        low, high = sorted(end * self.column.factor + self.column.offset for end in (low, high))
+        if low < self.lowest[0]:
+            self.lowest = low, first + int(np.nanargmin(cells))
+        if high > self.highest[0]:
+            self.highest = high, first + int(np.nanargmax(cells))
+
+
 class RawLogBuilder:
     """Collect the blocks of one file and build its raw log."""
 
@@ -76,18 +104,12 @@ class RawLogBuilder:
         self.buffers = Buffers(dtypes)
         self.bad_cells = self.gyro_cells = 0  # the latter in rows that are readable otherwise
         self.bad_rows, self.cell_rows = _Places(), _Places()
-        self.missing: Counter[int] = Counter()  # missing values by column number
         #: Range of the stamps of readable rows [ns since 1970]; high < low if there are none.
         self.low, self.high = np.iinfo(np.int64).max, NAT
         unit = None if self.time is None else self.time.time_unit
         self.clock = TurningClock() if unit is not None and unit.epoch is None else None
-        #: Column number -> lowest and highest value in the inner unit, each with its row.
-        self.extremes = {
-            column.source: [(np.inf, 0), (-np.inf, 0)] for column in [*self.gyro, *self.channels]
-        }
-        #: Column number -> range, with zero, of whole numbers; None for others.
-        self.whole: dict[int, tuple[float, float] | None] = {
-            column.source: (0.0, 0.0) for column in [*self.gyro, *self.channels]
+        self.statistics = {
+            column.source: _Statistics(column) for column in [*self.gyro, *self.channels]
         }
 
     def prepare(self, values: Values, stamps: Ints | None, *, words: int = 0) -> ConvertedBlock:
@@ -123,13 +145,9 @@ class RawLogBuilder:
         """Add one block; messages name its rows by `locate` and `quote`."""
         if converted.rows == 0:
             return
-        for source, (missing, low, high, is_whole) in converted.ranges.items():
-            self.missing[source] += missing
-            span = self.whole[source]
-            if span is not None and missing < converted.rows:
-                self.whole[source] = (min(span[0], low), max(span[1], high)) if is_whole else None
         first = self.buffers.rows
-        self._find_extremes(converted, first)
+        for source, statistics in self.statistics.items():
+            statistics.add(converted.values[source], first, *converted.ranges[source])
         locate = locate or (lambda rows: [f"row {first + row}" for row in rows])
         self.bad_rows.add(converted.bad_rows, locate, quote)
         self.cell_rows.add(converted.cell_rows, locate, quote)
@@ -145,29 +163,14 @@ class RawLogBuilder:
             self.high = int(good.max(initial=self.high))
         self.buffers.add(block)
 
-    def _find_extremes(self, converted: ConvertedBlock, first: int) -> None:
-        """Note the rows of extremes beyond those of earlier blocks."""
-        for column in [*self.gyro, *self.channels]:
-            missing, *span, _ = converted.ranges[column.source]
-            cells = converted.values[column.source]
-            if missing == cells.size:
-                continue
-            low, high = sorted(end * column.factor + column.offset for end in span)
-            lowest, highest = self.extremes[column.source]
-            if low < lowest[0]:
-                lowest = low, first + int(np.nanargmin(cells))
-            if high > highest[0]:
-                highest = high, first + int(np.nanargmax(cells))
-            self.extremes[column.source] = [lowest, highest]
-
     def _packing_of(self, columns: Sequence[Column]) -> dict[str, Any]:
         """Return the encoding of columns of whole numbers with one factor; empty for others."""
-        spans = [self.whole[column.source] for column in columns]
-        factors = {column.factor for column in columns if column.offset == 0.0}
-        if None in spans or len(factors) != 1 or any(column.offset != 0.0 for column in columns):
+        statistics = [self.statistics[column.source] for column in columns]
+        laws = {(column.factor, column.offset) for column in columns}
+        factor, offset = laws.pop()
+        if laws or offset != 0.0 or not all(part.is_whole for part in statistics):
             return {}
-        reach = max(max(-low, high) for low, high in filter(None, spans))
-        return pack_counts(reach, factors.pop())
+        return pack_counts(max(part.reach for part in statistics), factor)
 
     def finish(self, notes: Sequence[str] = ()) -> xr.Dataset:
         """Return the raw log; `FormatError` if more than half of the rows are unreadable."""
@@ -182,7 +185,7 @@ class RawLogBuilder:
         notes = [
             *self.plan.notes,
             *notes,
-            *describe_codes([*self.gyro, *self.channels], columns, self.extremes),
+            *describe_codes(self.statistics.values(), columns),
             *self._describe_faults(rows),
             *(self.clock.describe() if self.clock is not None else ()),
         ]
@@ -223,7 +226,7 @@ class RawLogBuilder:
         notes, bad = [], self.bad_rows
         if bad.total:
             notes.append(f"{bad.total} of {rows} rows are unreadable: {bad.describe()}")
-        empty = sum(self.missing[column.source] == rows for column in self.gyro)
+        empty = sum(self.statistics[column.source].missing == rows for column in self.gyro)
         cells = self.gyro_cells - empty * (rows - bad.total)  # empty axes have a note later
         if cells:
             places = "" if empty else f": {self.cell_rows.describe()}"
@@ -239,9 +242,7 @@ class RawLogBuilder:
         if not self.bad_rows.total or self.low > self.high:
             return stamps
         hide = partial(_hide_others, low=self.low, high=self.high)
-        if isinstance(stamps, np.ndarray):
-            return hide(stamps)
-        return make_dask(Converted(stamps, hide, "datetime64[ns]"), CHUNK_ROWS)
+        return convert_values(stamps, hide, "datetime64[ns]")
 
     def _make_dataset(self, columns: dict[int, Any], stamps: Any) -> xr.Dataset:
         data: dict[str, Any] = {}
@@ -356,23 +357,20 @@ class _Places:
         return f"{kind}{'s' * (len(names) > 1)} {', '.join(numbers)}{others}"
 
 
-def describe_codes(
-    columns: Sequence[Column],
-    values: Mapping[int, Any],
-    extremes: Mapping[int, Sequence[tuple[float, int]]],
-) -> list[str]:
+def describe_codes(columns: Iterable[_Statistics], values: Mapping[int, Any]) -> list[str]:
     """Return notes on codes for missing values.
 
     They repeat far outside all other values, or are common codes and the only value. They are
-    searched in the first rows, and around the `extremes` (value, row) that are far outside those.
+    searched in the first rows, and around the extremes that are far outside those.
     """
     notes = []
-    for column in columns:
+    for statistics in columns:
+        column = statistics.column
         common = [code * column.factor + column.offset for code in _COMMON_CODES]
         begin, rows = 0, _read_window(values[column.source], 0)
         readings = rows[np.isfinite(rows)]
         code = _find_code(readings, common)
-        for value, row in extremes[column.source]:
+        for value, row in (statistics.lowest, statistics.highest):
             if code is None and row >= _CODE_ROWS and _is_far(value, readings):
                 begin = row - _CODE_ROWS // 2
                 rows = _read_window(values[column.source], begin)

@@ -113,9 +113,8 @@ def parse_time_unit(text: str, calendar: str | None = None) -> TimeUnit:
     name, *since = (part.strip() for part in _SINCE.split(text, maxsplit=1))
     epoch = _epoch_ns(text, since[0], calendar) if since else None
     factor, _, bare = name.rpartition(" ")
-    ns = (
-        None if bare == "Ms" else _NANOSECONDS.get(bare.lower(), _NANOSECONDS.get(bare))
-    )  # Ms is ambiguous: megasecond, or milliseconds mistyped
+    # Ms is ambiguous: megasecond, or milliseconds mistyped
+    ns = None if bare == "Ms" else _NANOSECONDS.get(bare.lower(), _NANOSECONDS.get(bare))
     if ns is None or (
         factor and not (len(factor) <= _MAX_DIGITS and _NUMBER.match(factor.strip()))
     ):
@@ -270,9 +269,9 @@ class TurningClock:
         steps = np.diff(good)
         typical = typical_step(good)
         backward = np.flatnonzero(steps < -min(CLOCK_PERIODS) // 2) + 1
-        turns = [] if self.last is None else [(0, find_turn(int(good[0]) - self.last, typical))]
+        turns = [] if self.last is None else [(0, find_turns(int(good[0]) - self.last, typical)[0])]
         for row in backward.tolist():
-            turn = find_turn(int(steps[row - 1]), typical)
+            turn, _ = find_turns(int(steps[row - 1]), typical)
             if not (row < steps.size and steps[row] > turn // 2):  # one wrong stamp
                 turns.append((row, turn))
         for row, turn in turns:
@@ -304,14 +303,21 @@ def typical_step(stamps: Ints) -> float:
     return float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
 
 
-def find_turn(step: int, typical: float) -> int:
-    """Return the period after which a clock began again at a step, if no row is lost there, or 0.
+def find_turns(step: int, typical: float, *, first: int | None = None) -> tuple[int, int]:
+    """Return the period of a clock that begins again at a step, and how often, or 0.
 
-    `typical` is a typical step of the stamps [ns].
+    No row is lost there; `typical` is a typical step of the stamps [ns]. Within a file a clock
+    begins again once. Between files it may have several times, with `first` as its first stamp from
+    its zero [ns].
 
     Examples
     --------
-    >>> find_turn(-86_399_950_000_000, 5e7), find_turn(-86_000_000_000_000, 5e7)
-    (86400000000000, 0)
+    >>> find_turns(-86_399_950_000_000, 5e7), find_turns(-86_000_000_000_000, 5e7)
+    ((86400000000000, 1), (0, 0))
     """
-    return next((turn for turn in CLOCK_PERIODS if 0 < step + turn <= 2 * typical < turn / 2), 0)
+    for period in CLOCK_PERIODS:
+        turns, rest = -(step // period), step % period
+        is_possible = turns == 1 if first is None else -period / 2 <= first < period
+        if is_possible and 0 < rest <= 2 * typical < period / 2:
+            return period, turns
+    return 0, 0

@@ -16,14 +16,14 @@ from gyrostab.errors import TimeError, UnitError
 from gyrostab.ingest.concat.grid import PlacedLog, Source, group_axes, merge_gaps, source_of
 from gyrostab.ingest.concat.lazy import PlacedArray, chunk_of, place_on_grid
 from gyrostab.ingest.concat.place import place_logs
-from gyrostab.ingest.gap_table import gap_variables, name_lost
+from gyrostab.ingest.gap_table import make_dataset, name_lost
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.schema import SIGNAL_UNITS, check_log, log_channels, signal_name, texts
-from gyrostab.store.lazy import concatenate_columns, convert_lazy, take_samples
+from gyrostab.store.lazy import concatenate_columns, convert_values, take_samples
 from gyrostab.store.private import close_function
 from gyrostab.store.write import common_packing
 from gyrostab.time.durations import duration_seconds
-from gyrostab.time.grid import grid_index, grid_times, time_coordinate
+from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import extend_history, format_stamp, to_nanoseconds
 from gyrostab.units import find_conversion
 from gyrostab.wording import list_some
@@ -98,7 +98,8 @@ def concatenate_logs(
         (source_of(log, Path(path).name) for log, path in zip(logs, paths, strict=True)),
         key=lambda source: source.start,
     )
-    _check_same(sources)
+    check_kinds((source.name, signal_name(source.log)) for source in sources)
+    _check_rates(sources)
     pieces, notes = place_logs(sources, max_gap=duration_seconds(max_gap, "max_gap"))
     rate = sources[0].rate
     start = int(grid_times(sources[0].start, rate, -pieces[0].first))
@@ -122,24 +123,15 @@ def concatenate_logs(
     )
     signal.encoding = common_packing(source.log[name].encoding for source in sources)
     channels, stamps = concatenate_channels(pieces, start, rate, size, chunk)
-    coordinates = (
-        xr.Coordinates({"axis": np.array(axes, dtype=str), **stamps})
-        .merge(time_coordinate(start, rate, size))
-        .coords
-    )
-    variables = {
-        name: signal,
-        **channels,
-        **gap_variables(name_lost(merge_gaps(pieces), lost, start, rate), start, rate),
-    }
-    joined = xr.Dataset(
-        variables,
-        coordinates,
+    joined = make_dataset(
+        {name: signal, **channels},
+        {"axis": np.array(axes, dtype=str), **stamps},
+        name_lost(merge_gaps(pieces), lost, start, rate),
+        (start, rate, size),
         _common_attributes(sources, size, [*notes, *_describe_absent(sources, axes)]),
     )
-    joined.set_close(
-        partial(_close_files, list(filter(None, map(close_function, logs))))
-    )  # keeps no other reference to the logs
+    # keeps no other reference to the logs
+    joined.set_close(partial(_close_files, list(filter(None, map(close_function, logs)))))
     return joined
 
 
@@ -167,17 +159,21 @@ def _close_files(files: Sequence[Callable[[], None]]) -> None:
         close()
 
 
-def _check_same(sources: Sequence[Source]) -> None:
-    """Refuse logs whose kind or sampling rate differs from the first."""
-    first = sources[0]
-    kind = signal_name(first.log)
-    for source in sources[1:]:
-        other_kind = signal_name(source.log)
+def check_kinds(kinds: Iterable[tuple[str, str | None]]) -> None:
+    """Refuse files, given by name, whose kind of signal differs from that of the first."""
+    (name, kind), *others = kinds
+    for other_name, other_kind in others:
         if other_kind != kind:
             raise UnitError(
-                f"{first.name} holds a gyro signal of kind {kind!r}, {source.name} of kind "
+                f"{name} holds a gyro signal of kind {kind!r}, {other_name} of kind "
                 f"{other_kind!r}; run them one by one"
             )
+
+
+def _check_rates(sources: Sequence[Source]) -> None:
+    """Refuse logs whose sampling rate differs from that of the first."""
+    first = sources[0]
+    for source in sources[1:]:
         if abs(source.rate / first.rate - 1) > RATE_TOLERANCE:
             raise TimeError(
                 f"{first.name} is a log of {first.rate:.10g} Hz and {source.name} one of "
@@ -189,15 +185,10 @@ def _check_same(sources: Sequence[Source]) -> None:
 def _describe_absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:
     """Return notes on axes and channels that some logs lack, unless those hold other axes."""
     groups = group_axes(sources, [source.axes for source in sources])
-    names = {
-        f"axis {axis}": _logs_without(groups, [s for s in sources if axis in s.axes])
-        for axis in axes
-    }
+    holders = {f"axis {axis}": [s for s in sources if axis in s.axes] for axis in axes}
     for channel in dict.fromkeys(name for source in sources for name in log_channels(source.log)):
-        names[f"channel {channel}"] = _logs_without(
-            groups, [source for source in sources if channel in source.log]
-        )
-    return absence_notes(names)
+        holders[f"channel {channel}"] = [source for source in sources if channel in source.log]
+    return absence_notes({name: _logs_without(groups, logs) for name, logs in holders.items()})
 
 
 def _logs_without(groups: Sequence[Sequence[Source]], holders: Sequence[Source]) -> list[str]:
@@ -332,12 +323,7 @@ def unify_units(logs: Sequence[tuple[str, xr.Dataset]], name: str, advice: str) 
         factor, offset = conversions[str(variable.attrs.get("units", "1"))] or (1.0, 0.0)
         if (factor, offset) != (1.0, 0.0):
             convert = partial(_scale_values, factor=factor, offset=offset)
-            is_lazy = hasattr(variable.data, "dask")
-            data = (
-                convert_lazy(variable.data, convert, np.float64)
-                if is_lazy
-                else convert(variable.data)
-            )
+            data = convert_values(variable.data, convert, np.float64)
             log = log.assign({name: (variable.dims, data, variable.attrs | {"units": target})})
         unified.append(log)
     return unified

@@ -260,46 +260,36 @@ def split_axes(raw: xr.Dataset) -> list[xr.Dataset]:
     groups = raw.attrs.get("axis_rows")
     if groups is None:
         return [raw]
-    parts = []
     if int(groups[-1][2]) != raw.sizes["row"]:
         raise SchemaError(
             "the rows of this raw log were selected after it was read; regularise the whole, and "
             "select from the regular log"
         )
-    name = signal_name(raw)
-    signal, places = raw[name], [str(axis) for axis in raw["axis"].values]
-    files = list(
-        zip(texts(raw, "source_files"), np.atleast_1d(raw.attrs["row_start"]).tolist(), strict=True)
-    )
-    for number, (axes, first, end) in enumerate(groups):
-        rows = [select_part(signal.data, places.index(axis), first, end) for axis in axes]
-        stack = stack_rows(rows)
-        data: dict[Any, Any] = {name: (("axis", "row"), stack, signal.attrs, signal.encoding)}
-        for key, variable in raw.data_vars.items():
-            if key != name and (variable.dims == ("row",) or number == 0):
-                values = (
-                    select_part(variable.data, None, first, end)
-                    if variable.dims == ("row",)
-                    else variable.data
-                )
-                data[key] = (variable.dims, values, variable.attrs, variable.encoding)
-        coords = {
-            str(key): raw[key].variable
-            for key in raw.coords
-            if str(key).startswith("time_") and number == 0
-        }
-        if "time" in raw.variables:
-            coords["time"] = xr.Variable("row", select_part(raw["time"].data, None, first, end))
-        group_files = [(file, start - first) for file, start in files if first <= start < end]
-        attrs = {key: value for key, value in raw.attrs.items() if key != "axis_rows"}
-        attrs |= {
-            "source_files": [file for file, _ in group_files],
-            "row_start": [start for _, start in group_files],
-        }
-        attrs |= (
-            {}
-            if number == 0
-            else {"notes": [], "history": "", "unreadable_rows": 0, "unreadable_cells": 0}
-        )
-        parts.append(xr.Dataset(data, {"axis": axes, **coords}, attrs))
-    return parts
+    return [_select_group(raw, *group, is_first=not number) for number, group in enumerate(groups)]
+
+
+def _select_group(
+    raw: xr.Dataset, axes: Sequence[str], first: int, end: int, *, is_first: bool
+) -> xr.Dataset:
+    """Return some axes and rows of a raw log; channels with separate stamps if they come first."""
+    name, places = signal_name(raw), [str(axis) for axis in raw["axis"].values]
+    signal = raw[name]
+    rows = [select_part(signal.data, places.index(axis), first, end) for axis in axes]
+    columns: dict[Any, Any] = {
+        name: (("axis", "row"), stack_rows(rows), signal.attrs, signal.encoding)
+    }
+    for key, column in raw.variables.items():
+        if column.dims == ("row",):
+            part = select_part(column.data, None, first, end)
+            columns[key] = ("row", part, column.attrs, column.encoding)
+    files = zip(texts(raw, "source_files"), np.atleast_1d(raw.attrs["row_start"]), strict=True)
+    own_files = [(file, int(start) - first) for file, start in files if first <= start < end]
+    attrs = {key: value for key, value in raw.attrs.items() if key != "axis_rows"}
+    attrs |= {"source_files": [file for file, _ in own_files]}
+    attrs |= {"row_start": [start for _, start in own_files]}
+    if not is_first:
+        attrs |= {"notes": [], "history": "", "unreadable_rows": 0, "unreadable_cells": 0}
+    others = raw.drop_dims(["axis", "row"]) if is_first else xr.Dataset()
+    group = others.assign(columns).assign_coords(axis=list(axes))
+    group.attrs = attrs
+    return group.set_coords({"time"} & set(columns))

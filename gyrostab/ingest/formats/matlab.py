@@ -49,7 +49,7 @@ from gyrostab.ingest.formats.tables import (
     make_reader,
 )
 from gyrostab.ingest.limits import check_chunk
-from gyrostab.ingest.options import FileSummary, ReadOptions
+from gyrostab.ingest.options import ReadOptions
 from gyrostab.store.damage import check_global_heaps
 from gyrostab.time.stamps import to_nanoseconds
 
@@ -82,14 +82,9 @@ def _open_tables(path: Path, options: ReadOptions) -> Iterator[TablesOfFile]:
         yield _make_tables(path, options, stack)
 
 
-_scan_matlab, read = make_reader("matlab", _open_tables)
-_scan_hdf5, _ = make_reader("hdf5", _open_tables)
-
-
-def scan(path: Path, options: ReadOptions) -> FileSummary:
-    """Summarise variables, shapes, and first and last stamps."""
-    is_hdf5 = path.suffix.lower() in HDF_SUFFIXES
-    return (_scan_hdf5 if is_hdf5 else _scan_matlab)(path, options)
+scan, read = make_reader(
+    lambda path: "hdf5" if path.suffix.lower() in HDF_SUFFIXES else "matlab", _open_tables
+)
 
 
 def _make_tables(path: Path, options: ReadOptions, stack: ExitStack) -> TablesOfFile:
@@ -163,29 +158,20 @@ def _find_clock(columns: Sequence[TableColumn]) -> int | None:
 def _name_fields(
     columns: Sequence[TableColumn], named: Sequence[str | None] = ()
 ) -> list[TableColumn]:
-    """Give fields their known names, except for those that others have."""
-    fields = _known_fields([column.name[0] for column in columns])
-    targets = [fields.get(place) for place in range(len(columns))]
-    return [
-        replace(column, target=None if target in named else target)
-        for column, target in zip(columns, targets, strict=True)
-    ]
-
-
-def _known_fields(headers: Sequence[str]) -> dict[int, str]:
-    """Return structure fields with known unique names, ``gyro_x`` of ``S.gyro_x``."""
-    names = [header.rpartition(".")[2].lower() for header in headers]
-    counts = Counter(names)
-    targets = {
-        place: name
-        for place, name in enumerate(names)
-        if counts[name] == 1 and (AXIS_PATTERN.match(name) or KNOWN_CHANNEL_PATTERN.match(name))
-    }
-    times = [place for place, name in enumerate(names) if TIME_PATTERN.match(name)]
-    if len(times) == 1:
-        suffix = time_suffix(names[times[0]])
-        targets[times[0]] = f"time [{suffix}]" if suffix and is_time_unit(suffix) else "time"
-    return {place: name for place, name in targets.items() if "." in headers[place]}
+    """Name structure fields by unique known names, ``gyro_x`` of ``S.gyro_x``, if not `named`."""
+    names = [column.name[0].rpartition(".")[2].lower() for column in columns]
+    counts, times = Counter(names), list(filter(TIME_PATTERN.match, names))
+    fields = []
+    for column, name in zip(columns, names, strict=True):
+        target = None
+        if times == [name]:
+            suffix = time_suffix(name)
+            target = f"time [{suffix}]" if suffix and is_time_unit(suffix) else "time"
+        elif counts[name] == 1 and (AXIS_PATTERN.match(name) or KNOWN_CHANNEL_PATTERN.match(name)):
+            target = name
+        is_field = "." in column.name[0] and target not in named
+        fields.append(replace(column, target=target if is_field else None))
+    return fields
 
 
 def _columns_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iterator[TableColumn]:

@@ -33,8 +33,7 @@ from gyrostab.ingest.formats.tables import (
     Table,
     TableColumn,
     TablesOfFile,
-    read_tables,
-    scan_tables,
+    make_reader,
 )
 from gyrostab.ingest.limits import check_chunk, check_declared
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
@@ -66,23 +65,27 @@ def matches(path: Path) -> bool:
 def scan(path: Path, options: ReadOptions) -> FileSummary:
     """Summarise variables, sizes, and first and last stamps."""
     log = _open_log(path, options)
-    if log is not None:
-        with log:
-            return _summarise_log(path, log)
-    with _open_undecoded(path) as stored:
-        form = "zarr" if path.is_dir() else "netcdf"
-        tables, notes = _find_tables(path, stored, options)
-        return scan_tables(path, form, tables, options, notes)
+    if log is None:
+        return _scan_tables(path, options)
+    with log:
+        return _summarise_log(path, log)
 
 
 def read(path: Path, options: ReadOptions) -> xr.Dataset:
     """Open a regular log lazily, or read the raw log of a foreign file; see `read_log`."""
     log = _open_log(path, options)
-    if log is not None:
-        return log
+    return _read_tables(path, options) if log is None else log
+
+
+@contextmanager
+def _open_tables(path: Path, options: ReadOptions) -> Iterator[TablesOfFile]:
     with _open_undecoded(path) as stored:
-        tables, notes = _find_tables(path, stored, options)
-        return read_tables(path, tables, options, notes=notes)
+        yield _find_tables(path, stored, options)
+
+
+_scan_tables, _read_tables = make_reader(
+    lambda path: "zarr" if path.is_dir() else "netcdf", _open_tables
+)
 
 
 def _find_tables(path: Path, stored: xr.Dataset, options: ReadOptions) -> TablesOfFile:

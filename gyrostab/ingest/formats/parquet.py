@@ -113,9 +113,8 @@ def _to_numpy(column: Any) -> Any:
     column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     kind = column.type
     if pa.types.is_timestamp(kind):
-        return column.cast(pa.timestamp(kind.unit)).to_numpy(
-            zero_copy_only=False
-        )  # in UTC; `to_stamps` converts the unit
+        # in UTC; `to_stamps` converts the unit
+        return column.cast(pa.timestamp(kind.unit)).to_numpy(zero_copy_only=False)
     if pa.types.is_duration(kind):
         column, kind = column.cast(pa.int64()), pa.int64()
     if pa.types.is_integer(kind) and column.null_count:

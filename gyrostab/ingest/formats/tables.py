@@ -285,9 +285,9 @@ def _add_clock(plan: Plan, source: int, described: Sequence[FileColumn], *, is_n
     planned = Column(source, own.header, "time", "time", "ns")
     if time is not None and replace(described[time.source], header="") == replace(own, header=""):
         planned = replace(time, source=source)
-    elif own.unit is not None:
+    elif own.stored is not None:
         try:
-            unit = parse_time_unit(own.unit, own.calendar)
+            unit = parse_time_unit(own.stored, own.calendar)
         except UnitError as error:
             plan.refuse(UnitError, str(error))
             return
@@ -334,18 +334,22 @@ def read_tables(
 
 
 def make_reader(
-    form: str, find_tables: FindTables, find_heads: FindTables | None = None
+    form: str | Callable[[Path], str],
+    find_tables: FindTables,
+    find_heads: FindTables | None = None,
 ) -> tuple[Callable[[Path, ReadOptions], FileSummary], Callable[[Path, ReadOptions], xr.Dataset]]:
     """Make the functions `scan` and `read` of a format whose tables are read as a whole.
 
-    `find_heads` finds the tables for `scan` if that can leave out their values. Either may be a
-    context manager that keeps the file open.
+    `form` is the name of the format, or finds that of a file. `find_heads` finds the tables for
+    `scan` if that can leave out their values. Both finders may be context managers that keep the
+    file open.
     """
 
     def scan(path: Path, options: ReadOptions) -> FileSummary:
         """Summarise columns, rows, and first and last stamps."""
         with _keep_open((find_heads or find_tables)(path, options)) as (tables, notes):
-            return scan_tables(path, form, tables, options, notes)
+            name = form if isinstance(form, str) else form(path)
+            return scan_tables(path, name, tables, options, notes)
 
     def read(path: Path, options: ReadOptions) -> xr.Dataset:
         """Return the raw log of a file; see `gyrostab.ingest.read_log`."""

@@ -24,9 +24,8 @@ from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, lib
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.time.stamps import to_nanoseconds
 
-_FIRST_DATE = np.datetime64(
-    "1950-01-01", "us"
-)  # LabVIEW counts from 1904, and writes 1904 if it has no clock
+#: LabVIEW counts from 1904, and writes 1904 if it has no clock.
+_FIRST_DATE = np.datetime64("1950-01-01", "us")
 #: Bytes before the metadata of a segment, flag of its byte order, and largest metadata that are
 #: searched.
 _LEAD_BYTES, _BIG_ENDIAN, _MAX_METADATA_BYTES = 28, 0x40, 2**24
@@ -84,11 +83,9 @@ def _waveform_clock(path: Path, channel: Any) -> tuple[float, Any] | None:
     start = properties.get("wf_start_time")
     if step <= 0.0:
         return None
-    start = (
-        None
-        if start is None or np.datetime64(start, "us") < _FIRST_DATE
-        else np.datetime64(start, "us")
-    )
+    start = None if start is None else np.datetime64(start, "us")
+    if start is not None and start < _FIRST_DATE:
+        start = None
     began = 0 if start is None else int(to_nanoseconds(np.array(start), far_as_nat=True))
     if began == NAT:
         raise FormatError(

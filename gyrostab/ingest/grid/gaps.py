@@ -25,31 +25,24 @@ from gyrostab.schema import GAP_CAUSES, signal_name
 
 def _missing_samples(placement: Placement, scanned: ScanPass) -> Ints:
     """List the samples without a row between the runs."""
-    runs, events = placement.runs, placement.events
+    runs = placement.runs
     end, start = runs[:-1, 0] + runs[:-1, 2], runs[1:, 0]
     # a late row that was put in its place has no neighbours among the rows
-    is_late = np.isin(runs[:, 1], events[events[:, EVENT_CAUSE] == OUT_OF_ORDER, EVENT_ROW])
+    is_late = np.isin(runs[:, 1], placement.events_of(OUT_OF_ORDER)[:, EVENT_ROW])
     row_end = np.maximum.accumulate(np.where(is_late, 0, runs[:, 1] + runs[:, 2]))[:-1]
     row_start = np.where(is_late[1:], row_end, runs[1:, 1])
-    listed_rows = np.sort(
-        events[np.isin(events[:, EVENT_CAUSE], (DUPLICATE, OUT_OF_ORDER)), EVENT_ROW]
-    )  # rows that have a line of another cause
-    skipped = (
-        row_start
-        - row_end
-        - (np.searchsorted(listed_rows, row_start) - np.searchsorted(listed_rows, row_end))
-    )
-    skipped = np.where(row_start > row_end, np.maximum(skipped, 0), 0)
-    broken = events[np.isin(events[:, EVENT_CAUSE], (STEP, RESTART))]
-    at = np.searchsorted(broken[:, EVENT_SAMPLE], end)
-    at_break = np.zeros(len(end), dtype=bool)
+    # rows that have a line of another cause
+    listed_rows = np.sort(placement.events_of(DUPLICATE, OUT_OF_ORDER)[:, EVENT_ROW])
+    listed_between = np.searchsorted(listed_rows, row_start) - np.searchsorted(listed_rows, row_end)
+    skipped = np.maximum(row_start - row_end - listed_between, 0)
     cause = np.where(skipped > 0, UNREADABLE, MISSING)
+    broken = placement.events_of(STEP, RESTART)
     if len(broken):
-        at = np.minimum(at, len(broken) - 1)
+        at = np.minimum(np.searchsorted(broken[:, EVENT_SAMPLE], end), len(broken) - 1)
         at_break = broken[at, EVENT_SAMPLE] == end
         cause = np.where(at_break, broken[at, EVENT_CAUSE], cause)
     listed = (start > end) | ((skipped > 0) & (scanned.absent_count <= 0.01 * scanned.row_count))
-    return np.stack([end, start, start - end, skipped, cause], axis=1)[listed]
+    return np.asarray(np.stack([end, start, start - end, skipped, cause], axis=1)[listed])
 
 
 def _unusable_cells(spans: Ints, cause: int, placement: Placement) -> Ints:
@@ -66,9 +59,9 @@ def _unusable_cells(spans: Ints, cause: int, placement: Placement) -> Ints:
     return np.stack([first, first + rows, rows, rows, np.full_like(rows, cause)], axis=1)
 
 
-def _dropped_rows(events: Ints) -> Ints:
+def _dropped_rows(placement: Placement) -> Ints:
     """List the dropped or moved rows; consecutive rows of one cause are one line."""
-    rows = events[np.isin(events[:, EVENT_CAUSE], (DUPLICATE, OUT_OF_ORDER))]
+    rows = placement.events_of(DUPLICATE, OUT_OF_ORDER)
     rows = rows[np.argsort(rows[:, EVENT_ROW], kind="stable")]
     if len(rows) == 0:
         return np.empty((0, 5), dtype=np.int64)
@@ -95,7 +88,7 @@ def find_gaps(placement: Placement, scanned: ScanPass) -> Ints:
             _missing_samples(placement, scanned),
             *(_unusable_cells(spans, UNREADABLE, placement) for spans in unreadable),
             _unusable_cells(scanned.infinite, OUTSIDE_RANGE, placement),
-            _dropped_rows(placement.events),
+            _dropped_rows(placement),
         ]
     )
     return sort_lines(table)

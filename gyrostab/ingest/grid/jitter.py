@@ -8,7 +8,7 @@ packets, or a slow clock gives many rows one stamp, only one row of each group i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -114,18 +114,16 @@ def fit_jitter(
         if model.sigma <= _MAX_LOSSY_SIGMA or model.loss_nats > _LOSSY_NATS
     ]
     explained = min(known, key=lambda jitter: jitter.code_length, default=None)
-    return (
-        explained if explained is not None and explained.fits else None
-    )  # the best may fit stamps of doubled rows
+    # the best may fit stamps of doubled rows
+    return explained if explained is not None and explained.fits else None
 
 
 def _start_on_lines(
     observed: list[Block], observe: str, group: float, sure: float
 ) -> list[tuple[float, float]]:
     """Return the best periods [ns] near the slopes of stretches, and their jitter [samples]."""
-    lengths = (
-        (32, 16) if observe == "all" else (8,)
-    )  # with lost samples, only few consecutive groups are complete
+    # with lost samples, only few consecutive groups are complete
+    lengths = (32, 16) if observe == "all" else (8,)
     lines = next(filter(None, (_fit_lines(observed, length) for length in lengths)), None)
     if lines is None or not (lines[0] > 0).any():
         return []
@@ -136,10 +134,8 @@ def _start_on_lines(
     periods = _candidate_periods(observed, slope, group)
     n_rows = max(64, _SEARCH_ROWS // len(observed))
     sample = [(count[:n_rows], stamps[:n_rows]) for count, stamps in observed]
-    best = sorted(periods, key=lambda period: _row_cost(sample, period, sigma_ns, sure))[
-        :_MAX_REFINED
-    ]
-    return [(period, sigma_ns / period) for period in best]
+    best = sorted(periods, key=lambda period: _row_cost(sample, period, sigma_ns, sure))
+    return [(period, sigma_ns / period) for period in best[:_MAX_REFINED]]
 
 
 def fit_jitter_near(
@@ -215,29 +211,33 @@ def _row_cost(observed: list[Block], period: float, sigma_ns: float, sure: float
     return float(total / sum(len(count) for count, _ in observed))
 
 
+def _follow_rows(
+    count: Ints, stamps: Ints, jitter: JitterModel, gain: float, longest: float
+) -> tuple[Ints, Ints, Floats, float]:
+    """Return sample and piece of each row, its distance from the sample [samples], and the cost."""
+    law = jitter.period, max(jitter.sigma, MIN_SIGMA), gain, longest, jitter.loss_nats
+    sample, piece, off, nats = follow(count, stamps, *law, TRACE_ROWS)
+    return sample, piece, off, nats
+
+
 def _refine_model(
     observed: list[Block], jitter: JitterModel, sure: float, *, most_off: float = 0.05
 ) -> JitterModel | None:
     """Refine period and jitter along the sequence of samples; None if the fit fails."""
     if not observed:
         return None
-    period, sigma, loss_nats = jitter.period, jitter.sigma, LOSS_NATS
+    start, period, sigma = jitter.period, jitter.period, jitter.sigma
     for gain in (_SEARCH_GAIN, _SEARCH_GAIN / 2, GAIN, GAIN):
         cc = ct = nats = rows = dropped = single = steps = 0.0
         offs, losses = [], []
         for count, stamps in observed:
-            floored_sigma = max(sigma, MIN_SIGMA)
-            sample, piece, off, cost = follow(
-                count, stamps, period, floored_sigma, gain, sure * period, loss_nats, TRACE_ROWS
-            )
+            sample, piece, off, cost = _follow_rows(count, stamps, jitter, gain, sure * period)
             is_near = _is_near(off, sigma)
             sums = piece_sums(stamps[is_near], sample[is_near], piece[is_near], period)
             cc, ct = cc + sums[:, 3].sum(), ct + sums[:, 4].sum()
             nats, rows = nats + cost, rows + len(count)
-            sample_step, count_step = (
-                np.diff(sample)[np.diff(piece) == 0],
-                np.diff(count)[np.diff(piece) == 0],
-            )
+            is_unbroken = np.diff(piece) == 0
+            sample_step, count_step = np.diff(sample)[is_unbroken], np.diff(count)[is_unbroken]
             dropped += (np.maximum(count_step - sample_step, 0)).sum()
             single, steps = single + (sample_step == count_step).sum(), steps + len(sample_step)
             offs.append(off)
@@ -246,9 +246,10 @@ def _refine_model(
             return None
         period = float(ct / cc)
         sigma = 1.4826 * float(np.median(np.abs(np.concatenate(offs))))
-        correction, loss_nats = _price_losses(np.concatenate(losses), loss_nats)
+        correction, loss_nats = _price_losses(np.concatenate(losses), jitter.loss_nats)
+        jitter = replace(jitter, period=period, sigma=sigma, loss_nats=loss_nats)
         nats += correction
-        if not abs(period / jitter.period - 1) < most_off or sigma > 2 * _MAX_SIGMA:
+        if not abs(period / start - 1) < most_off or sigma > 2 * _MAX_SIGMA:
             return None
     fits = (
         sigma < _MAX_SIGMA
@@ -256,7 +257,7 @@ def _refine_model(
         and nats < _MAX_NATS * rows
         and single > 0.1 * steps
     )
-    return JitterModel(period, sigma, jitter.observe, jitter.group, nats / rows, loss_nats, fits)
+    return replace(jitter, nats=nats / rows, fits=fits)
 
 
 def _price_losses(lost: Ints, loss_nats: float) -> tuple[float, float]:
@@ -285,16 +286,7 @@ def count_samples(
     at = observe_rows(stamps, jitter.observe, jitter.period)
     if jitter.observe != "all":
         at = at[1:-1]  # the groups at both ends may be cut
-    sample, piece, off, _ = follow(
-        rows[at],
-        stamps[at],
-        jitter.period,
-        max(jitter.sigma, MIN_SIGMA),
-        GAIN,
-        longest,
-        jitter.loss_nats,
-        TRACE_ROWS,
-    )
+    sample, piece, off, _ = _follow_rows(rows[at], stamps[at], jitter, GAIN, longest)
     is_near = _is_near(off, jitter.sigma)
     return stamps[at][is_near], sample[is_near], piece[is_near]
 

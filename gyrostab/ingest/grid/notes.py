@@ -19,7 +19,7 @@ from gyrostab.ingest.grid.jitter import MIN_SIGMA
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.rate import DeviatingStretch, RateEstimate
 from gyrostab.ingest.grid.scan_pass import ScanPass, file_of, record_name
-from gyrostab.kernels.grid.stamps import DUPLICATE, EVENT_CAUSE, EVENT_ROW, OUT_OF_ORDER
+from gyrostab.kernels.grid.stamps import DUPLICATE, EVENT_ROW, OUT_OF_ORDER
 from gyrostab.schema import log_channels
 from gyrostab.time.grid import grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
@@ -213,7 +213,7 @@ def _describe_deviating(
 
 def _describe_breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
     notes = []
-    events = placement.events[placement.events[:, EVENT_CAUSE] >= min(CLOCK_STEP, RESTART)]
+    events = placement.events_of(CLOCK_STEP, RESTART)
     for cause, _sample, row, before, after in events[:_MAX_NAMED].tolist():
         file, local = file_of(raw, row)
         text = describe_break(f" at row {local}", cause, before, after, "rows")
@@ -272,8 +272,7 @@ def describe_placement(
     """Return notes on gaps, restarts, and rows and cells that were dropped or moved."""
     where = record_name(raw)
     notes = [*_describe_breaks(raw, placement), *_describe_missing(raw, placement, table)]
-    events = placement.events
-    twice = events[events[:, EVENT_CAUSE] == DUPLICATE]
+    twice = placement.events_of(DUPLICATE)
     if len(twice):
         first = _name_row(raw, int(twice[:, EVENT_ROW].min()))
         notes.append(
@@ -282,7 +281,7 @@ def describe_placement(
             + _IF_HIGHER
             * (len(twice) > _MANY_SHARE * scanned.row_count)
         )
-    late = events[events[:, EVENT_CAUSE] == OUT_OF_ORDER]
+    late = placement.events_of(OUT_OF_ORDER)
     n_placed = int((placement.samples_of(late[:, EVENT_ROW]) >= 0).sum())
     if len(late):
         notes.append(

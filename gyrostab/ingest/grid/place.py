@@ -82,11 +82,14 @@ class Placement:
         inside = (which >= 0) & (rows < runs[which, 1] + runs[which, 2])
         return np.where(inside, runs[which, 0] + rows - runs[which, 1], -1)
 
+    def events_of(self, *causes: int) -> Ints:
+        """Return the events of some causes."""
+        return self.events[np.isin(self.events[:, EVENT_CAUSE], causes)]
+
     @property
     def has_late_rows(self) -> bool:
         """Whether three consecutive rows were dropped, as happens after a pause."""
-        is_dropped = np.isin(self.events[:, EVENT_CAUSE], (DUPLICATE, OUT_OF_ORDER))
-        rows = np.sort(self.events[is_dropped, EVENT_ROW])
+        rows = np.sort(self.events_of(DUPLICATE, OUT_OF_ORDER)[:, EVENT_ROW])
         rows = rows[self.samples_of(rows) < 0]
         return bool((rows[2:] - rows[:-2] == 2).any())
 

@@ -30,6 +30,9 @@ class _Placer:
     def __init__(self, jitter: JitterModel, period: float, max_gap_ns: float):
         self.jitter, self.period, self.max_gap_ns = jitter, period, max_gap_ns
         self.sigma = max(jitter.sigma, MIN_SIGMA)
+        #: Constants of `trace`, and its state: lost samples, phase and number of used rows.
+        self.law = period, self.sigma, GAIN, HOLD, max_gap_ns / period, jitter.loss_nats
+        self.state = 0, 0.0, 0
         self.start: int | None = None
         self.latest = 0
         self.last = -1  # sample of the latest row
@@ -71,7 +74,7 @@ class _Placer:
         """Begin a piece; its first row is the next sample but one, or the first of the log."""
         ahead = find_phase(count[at], stamps[at], self.period, self.sigma)
         self.origin = int(stamps[at[0]]) + int(np.rint(ahead * self.period))
-        self.count0, self.level, self.phase, self.observed = int(count[at[0]]), 0, 0.0, 0
+        self.count0, self.state = int(count[at[0]]), (0, 0.0, 0)
         self.base = int(count[at[0]] - count[0])
 
     def _leave_out_first(self, at: Ints, stamps: Ints) -> Ints:
@@ -83,7 +86,7 @@ class _Placer:
 
     def _set_first_sample(self, level: int) -> None:
         """Set the first sample of the piece, whose first row has lost `level` samples."""
-        self.level = level
+        self.state = level, *self.state[1:]
         self.base -= level
         if self.start is None:
             self.start = self.origin - int(np.rint(self.base * self.period))
@@ -100,38 +103,20 @@ class _Placer:
             self._begin_piece(count, stamps, at)
         levels, phases = np.empty(len(at), dtype=np.int64), np.empty(len(at))
         if len(at):
-            trace(
-                count[at],
-                stamps[at],
-                self.count0,
-                self.origin,
-                self.period,
-                self.sigma,
-                GAIN,
-                HOLD,
-                self.max_gap_ns / self.period,
-                self.jitter.loss_nats,
-                self.level,
-                self.phase,
-                self.observed,
-                levels,
-                phases,
-            )
+            piece = count[at], stamps[at], self.count0, self.origin
+            trace(*piece, *self.law, *self.state, levels, phases)
         if begins:
             self._set_first_sample(int(levels[0]))
         nearest = np.searchsorted(
             at, np.arange(n), side="left" if self.jitter.observe == "last" else "right"
         )
         nearest -= self.jitter.observe != "last"
-        padded_levels = np.append(levels, self.level if len(at) == 0 else levels[-1])
-        level = np.where(nearest < 0, self.level, padded_levels[np.clip(nearest, 0, len(at))])
+        first_level, _, observed = self.state
+        padded_levels = np.append(levels, first_level if len(at) == 0 else levels[-1])
+        level = np.where(nearest < 0, first_level, padded_levels[np.clip(nearest, 0, len(at))])
         done = int(np.searchsorted(at, n))
         if done:
-            self.level, self.phase, self.observed = (
-                int(levels[done - 1]),
-                float(phases[done - 1]),
-                self.observed + done,
-            )
+            self.state = int(levels[done - 1]), float(phases[done - 1]), observed + done
         self._add_rows(rows[:n], count[:n] - self.count0 + level + self.base, stamps[:n])
 
     def _add_rows(self, rows: Ints, sample: Ints, stamps: Ints) -> None:

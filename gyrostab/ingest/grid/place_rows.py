@@ -32,7 +32,6 @@ from gyrostab.ingest.grid.starting_period import SECOND, Stamps
 from gyrostab.kernels.grid.stamps import (
     DUPLICATE,
     EVENT_BEFORE,
-    EVENT_CAUSE,
     EVENT_ROW,
     EVENT_STAMP,
     NO_STAMP,
@@ -122,10 +121,8 @@ class RowPlacer:
                 estimate, note = self._estimate_declared(stamps, estimate, declared)
                 notes.append(note)
             # a given rate settles the question
-            rate, estimate = (
-                declared,
-                replace(estimate, rate_with_losses=None, rate_without_losses=None),
-            )
+            rate = declared
+            estimate = replace(estimate, rate_with_losses=None, rate_without_losses=None)
         deviating: list[DeviatingStretch] = []
         if estimate.places_by_count:
             stamps_to_count = partial(stamp_blocks, raw, scanned, all_rows=count_all_rows)
@@ -184,10 +181,8 @@ class RowPlacer:
     ) -> tuple[RateEstimate, str]:
         """Estimate the rate near a declared one that the stamps alone do not say, with a note."""
         near_estimate = estimate_near(stamps, declared)
-        named = (
-            estimate.rate_without_losses is not None
-            and abs(declared / estimate.rate_without_losses - 1) <= _MAX_RATE_DIFFERENCE
-        )  # without the recurring losses
+        lower = estimate.rate_without_losses or np.inf  # without the recurring losses
+        named = abs(declared / lower - 1) <= _MAX_RATE_DIFFERENCE
         if (
             near_estimate is None
             or abs(declared / near_estimate.unrounded - 1) > _MAX_RATE_DIFFERENCE
@@ -263,9 +258,8 @@ def find_repeats(raw: xr.Dataset, placement: Placement) -> Ints:
 
     Returns (n, 3): first row of the repetition, first row of what it repeats, number of rows.
     """
-    events = placement.events
-    is_break = np.isin(events[:, EVENT_CAUSE], (STEP, RESTART))
-    back = events[is_break & (events[:, EVENT_STAMP] < events[:, EVENT_BEFORE])]
+    breaks = placement.events_of(STEP, RESTART)
+    back = breaks[breaks[:, EVENT_STAMP] < breaks[:, EVENT_BEFORE]]
     repeats: list[tuple[int, int, int]] = []
     for row, stamp in sorted(zip(back[:, 2].tolist(), back[:, 4].tolist(), strict=True)):
         if repeats and row < repeats[-1][0] + repeats[-1][2]:

@@ -26,7 +26,7 @@ from gyrostab.ingest.gap_table import (
     FIRST,
     MISSING,
     SAMPLES,
-    gap_variables,
+    make_dataset,
     name_lost,
     sort_gaps,
 )
@@ -39,7 +39,6 @@ from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, record
 from gyrostab.ingest.limits import check_limits
 from gyrostab.ingest.uniform import as_uniform, check_same_rate
 from gyrostab.kernels.grid.stamps import (
-    EVENT_CAUSE,
     EVENT_ROW,
     EVENT_SAMPLE,
     EVENT_STAMP,
@@ -51,7 +50,7 @@ from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts
 from gyrostab.store.lazy import read_slice
 from gyrostab.store.write import chunk_samples
 from gyrostab.time.durations import duration_seconds
-from gyrostab.time.grid import check_rate, check_span, first_stamp, grid_times, time_coordinate
+from gyrostab.time.grid import check_rate, check_span, first_stamp, grid_times
 from gyrostab.time.stamps import extend_history, format_stamp
 from gyrostab.units import HOUR
 from gyrostab.wording import list_some
@@ -302,20 +301,15 @@ def _place_log(
         )
     attributes = {**raw[name].attrs, "units": SIGNAL_UNITS[kind]}
     variables, channel_times = _place_channels(raw, scanned, placement, chunk)
-    variables = {
-        kind: (("axis", "time"), data, attributes, packing),
-        **variables,
-        **gap_variables(sort_gaps(table), start, hertz),
-    }
-    coordinates = (
-        xr.Coordinates({"axis": raw["axis"].variable, **channel_times})
-        .merge(time_coordinate(start, hertz, size))
-        .coords
+    rows = f"{placement.placed_count} of {scanned.row_count} rows"
+    done = f"{rows} on {size} samples at {hertz:.10g} Hz"
+    log = make_dataset(
+        {kind: (("axis", "time"), data, attributes, packing), **variables},
+        {"axis": raw["axis"].variable, **channel_times},
+        sort_gaps(table),
+        (start, hertz, size),
+        _log_attributes(raw, kind, hertz, done, notes),
     )
-    done = (
-        f"{placement.placed_count} of {scanned.row_count} rows on {size} samples at {hertz:.10g} Hz"
-    )
-    log = xr.Dataset(variables, coordinates, _log_attributes(raw, kind, hertz, done, notes))
     if placement.rate_changes:
         log.attrs["rate_changes"] = list(map(format_stamp, placement.rate_changes))
     return log.assign_attrs(notes=[*log.attrs["notes"], *describe_channels(log)])
@@ -361,7 +355,7 @@ def gather_channel(
 ) -> tuple[NDArray[np.datetime64], Floats]:
     """Return stamps and values of the filled rows of a slow channel."""
     channel = raw[name].data
-    breaks = placement.events[np.isin(placement.events[:, EVENT_CAUSE], (STEP, RESTART))]
+    breaks = placement.events_of(STEP, RESTART)
     breaks = breaks[np.argsort(breaks[:, EVENT_ROW], kind="stable")]
     grid_stamps = grid_times(placement.start, placement.rate, breaks[:, EVENT_SAMPLE] + 1)
     moved = np.concatenate([[0], grid_stamps - breaks[:, EVENT_STAMP]])

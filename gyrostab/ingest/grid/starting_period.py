@@ -292,9 +292,8 @@ def _stamped_period(parts: Parts) -> float:
     period = period_of_lines(parts)
     if period is None:
         period = _refine_period(steps, float(np.quantile(rising, 0.5, method="lower")))
-        if (
-            rms_misfit(steps, period) > 0.2
-        ):  # with most rows missing, the median step is longer than one sample
+        if rms_misfit(steps, period) > 0.2:
+            # with most rows missing, the median step is longer than one sample
             shorter = _refine_period(steps, float(np.quantile(rising, 0.1)))
             # with random losses a single sample is the most frequent step; stamps in whole
             # milliseconds are also multiples of a millisecond

@@ -20,7 +20,6 @@ from gyrostab.ingest.gap_table import (
     SAMPLES,
     clip_table,
     gap_variables,
-    read_gap_columns,
     read_gaps,
     sort_gaps,
 )
@@ -28,7 +27,7 @@ from gyrostab.ingest.uniform.grid import UniformGrid, find_grid
 from gyrostab.schema import check_log, name_axes, require_dataset, signal_name, texts
 from gyrostab.store.lazy import find_source, hide_infinite
 from gyrostab.store.private import close_function, is_in_memory
-from gyrostab.time.grid import TimeGridIndex, grid_index, time_coordinate
+from gyrostab.time.grid import TimeGridIndex, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
 
 Table = Ints
@@ -179,7 +178,8 @@ def _with_true_table(
         if abs(declared / grid.rate - 1) < 1e-9:
             fitting = table
         elif computed:  # averaged samples have other gaps than selected ones
-            fitting = _change_rate(table, log, declared, grid)
+            old_table = read_gaps(log, grid.start, declared)
+            fitting = None if old_table is None else _change_rate(old_table, grid.rate / declared)
     if table is None or fitting is None:
         return with_table(log, None, grid)
     fitting = clip_table(fitting, 0, grid.size)
@@ -223,19 +223,12 @@ def place_samples(log: xr.Dataset, grid: UniformGrid) -> xr.Dataset:
     return placed_log
 
 
-def _change_rate(table: Table, log: xr.Dataset, old_rate: float, grid: UniformGrid) -> Table:
-    """Convert the table for a log of which every n-th sample was selected.
-
-    `table` is that of `read_gaps`, on the grid of the selected samples; `log` has the exact ends of
-    the gaps; the table was made for the sampling rate `old_rate` [Hz].
-    """
-    columns = read_gap_columns(log)
-    assert columns is not None  # read_gaps has read them
+def _change_rate(table: Table, ratio: float) -> Table:
+    """Convert a table for a log of which every n-th sample was selected; `ratio` is 1 / n."""
+    old_length = table[:, END] - table[:, FIRST]
     table = table.copy()
-    old_length = np.rint((columns[1] - columns[0]) * (old_rate / 1e9)).astype(np.int64)
-    for column, stamps in ((FIRST, columns[0]), (END, columns[1])):
-        # the first selected sample at or after it
-        table[:, column] = np.ceil(grid_index(grid.start, grid.rate, stamps) - 1e-6)
+    # the first selected sample at or after it
+    table[:, [FIRST, END]] = np.ceil(table[:, [FIRST, END]] * ratio - 1e-6)
     length = table[:, END] - table[:, FIRST]
     share = np.divide(table[:, SAMPLES], old_length, out=np.zeros(len(table)), where=old_length > 0)
     lost = (table[:, SAMPLES] > 0) & (length == 0)  # between two selected samples
@@ -247,7 +240,7 @@ def _change_rate(table: Table, log: xr.Dataset, old_rate: float, grid: UniformGr
 def _add_holes(table: Table, runs: Table) -> Table:
     """Add the samples between runs that the table does not list, with cause "missing"."""
     first, end = runs[:-1, 0] + runs[:-1, 2], runs[1:, 0]
-    begin, stop = merge_lines(table[table[:, END] > table[:, FIRST]])
+    begin, stop = merge_spans([table[table[:, END] > table[:, FIRST]][:, [FIRST, END]]]).T
     if len(begin):  # clip by listed gaps at either end, then count listed samples within
         which = np.maximum(np.searchsorted(begin, first, side="right") - 1, 0)
         first = np.where((begin[which] <= first) & (first < stop[which]), stop[which], first)
@@ -268,16 +261,12 @@ def _add_holes(table: Table, runs: Table) -> Table:
 
 def merge_spans(spans: Sequence[Table]) -> Table:
     """Return the union of half-open spans (first, end), in order."""
-    return np.stack(merge_lines(np.concatenate([*spans, np.empty((0, 2), np.int64)])), axis=1)
-
-
-def merge_lines(table: Table) -> tuple[Ints, Ints]:
-    """Return first samples and ends of the union of the lines of a table."""
-    order = np.argsort(table[:, FIRST], kind="stable")
-    first, end = table[order, FIRST], np.maximum.accumulate(table[order, END])
+    table = np.concatenate([*spans, np.empty((0, 2), np.int64)])
+    first, end = table[np.argsort(table[:, 0], kind="stable")].T
+    end = np.maximum.accumulate(end)
     is_apart = first[1:] > end[:-1]
     edge = np.ones(min(len(table), 1), dtype=bool)
-    return first[np.append(edge, is_apart)], end[np.append(is_apart, edge)]
+    return np.stack([first[np.append(edge, is_apart)], end[np.append(is_apart, edge)]], axis=1)
 
 
 def add_spans(table: Table, spans: Table, cause: int) -> Table:

@@ -105,19 +105,18 @@ def cut_log(
             "the time axis of this log is not computed; bring it onto one first, with "
             "gyrostab.ingest.uniform.as_uniform"
         )
-    clock = _Clock(grid)
-    low = 0 if time_from is None else clock.sample_of(time_from, "--from", last=grid.size - 1)
-    high = grid.size if time_to is None else clock.sample_of(time_to, "--to", last=grid.size)
+    low = 0 if time_from is None else _sample_of(grid, time_from, "--from", last=grid.size - 1)
+    high = grid.size if time_to is None else _sample_of(grid, time_to, "--to", last=grid.size)
     if low >= high:
         ends = (("--from", time_from), ("--to", time_to))
         named = " and ".join(f"{option} {end}" for option, end in ends if end is not None)
-        raise OptionError(f"{named} leaves no sample of the log; {clock.describe()}")
-    given = [clock.span_of(span, low, high) for span in spans]
+        raise OptionError(f"{named} leaves no sample of the log; {_describe_record(grid)}")
+    given = [_span_of(grid, span, low, high) for span in spans]
     excluded = merge_spans([np.array([span]) for span in given if span[1] > span[0]])
     kept_spans = np.concatenate([[low], excluded.ravel(), [high]]).reshape(-1, 2)
     kept_spans = kept_spans[kept_spans[:, 1] > kept_spans[:, 0]]
     if not len(kept_spans):
-        raise OptionError(f"--exclude leaves nothing of the log; {clock.describe()}")
+        raise OptionError(f"--exclude leaves nothing of the log; {_describe_record(grid)}")
     first, end = kept_spans.T
     runs = np.stack([first - low, first, end - first], axis=1)
     start = int(grid_times(grid.start, grid.rate, low))
@@ -168,51 +167,45 @@ def _parse_spans(exclude: Any) -> list[tuple[Any, Any]]:
     return spans
 
 
-class _Clock:
-    """Convert instants to samples of a log."""
+def _describe_record(grid: UniformGrid) -> str:
+    """Describe the time range of a log."""
+    edges = grid_times(grid.start, grid.rate, [0, grid.size]).view("datetime64[ns]")
+    first, end = (str(edge).rstrip("0").rstrip(".") for edge in edges)
+    return f"the record goes from {first} to {end} ({grid.size / grid.rate:.6g} s)"
 
-    def __init__(self, grid: UniformGrid):
-        self.grid = grid
 
-    def describe(self) -> str:
-        """Describe the time range of the record."""
-        start, rate, size, _ = self.grid
-        first, end = (str(np.datetime64(int(grid_times(start, rate, n)), "ns")) for n in (0, size))
-        first, end = (text.rstrip("0").rstrip(".") for text in (first, end))
-        return f"the record goes from {first} to {end} ({size / rate:.6g} s)"
+def _sample_of(grid: UniformGrid, value: Any, option: str, *, last: int) -> int:
+    """Return the first sample at or after an instant, which must lie in the record."""
+    sample = _first_at(grid, value, option)
+    if sample < 0 or sample > last:
+        raise OptionError(f"{option} {value} lies outside the record; {_describe_record(grid)}")
+    return sample
 
-    def sample_of(self, value: Any, option: str, *, last: int) -> int:
-        """Return the first sample at or after an instant, which must lie in the record."""
-        sample = self.first_at(value, option)
-        if sample < 0 or sample > last:
-            raise OptionError(f"{option} {value} lies outside the record; {self.describe()}")
-        return sample
 
-    def first_at(self, value: Any, option: str, *, example: str = _EXAMPLE) -> int:
-        """Return the first grid sample at or after an instant, even outside the record."""
-        instant = parse_instant(value, option, example=example)
-        if isinstance(instant, float):  # keep it within 64-bit nanoseconds
-            instant = min(instant, (self.grid.size + 1) / self.grid.rate)
-        stamp = instant if isinstance(instant, int) else self.grid.start + round(instant * 1e9)
-        sample = (
-            int(np.ceil(grid_index(self.grid.start, self.grid.rate, stamp))) - 1
-        )  # rounding may be one too high
-        while int(grid_times(self.grid.start, self.grid.rate, sample)) < stamp:
-            sample += 1
-        return sample
+def _first_at(grid: UniformGrid, value: Any, option: str, *, example: str = _EXAMPLE) -> int:
+    """Return the first grid sample at or after an instant, even outside the record."""
+    stamp = parse_instant(value, option, example=example)
+    if isinstance(stamp, float):  # keep it within 64-bit nanoseconds
+        stamp = grid.start + round(min(stamp, (grid.size + 1) / grid.rate) * 1e9)
+    # rounding may be one too high
+    sample = int(np.ceil(grid_index(grid.start, grid.rate, stamp))) - 1
+    while int(grid_times(grid.start, grid.rate, sample)) < stamp:
+        sample += 1
+    return sample
 
-    def span_of(self, ends: tuple[Any, Any], low: int, high: int) -> tuple[int, int]:
-        """Return the samples of an excluded span within the kept part."""
-        text = f"{ends[0]}/{ends[1]}"
-        first, end = (self.first_at(value, "--exclude", example=_SPAN_EXAMPLE) for value in ends)
-        if end < first:
-            raise OptionError(
-                f"--exclude {text}: its end comes before its start; write START/END, for "
-                f"instance {_SPAN_EXAMPLE}"
-            )
-        if first >= self.grid.size or end <= 0:
-            raise OptionError(f"--exclude {text} lies outside the record; {self.describe()}")
-        return max(first, low), min(end, high)
+
+def _span_of(grid: UniformGrid, ends: tuple[Any, Any], low: int, high: int) -> tuple[int, int]:
+    """Return the samples of an excluded span within the kept part."""
+    text = f"{ends[0]}/{ends[1]}"
+    first, end = (_first_at(grid, value, "--exclude", example=_SPAN_EXAMPLE) for value in ends)
+    if end < first:
+        raise OptionError(
+            f"--exclude {text}: its end comes before its start; write START/END, for "
+            f"instance {_SPAN_EXAMPLE}"
+        )
+    if first >= grid.size or end <= 0:
+        raise OptionError(f"--exclude {text} lies outside the record; {_describe_record(grid)}")
+    return max(first, low), min(end, high)
 
 
 def _cut_samples(log: xr.Dataset, kept_grid: UniformGrid, low: int) -> xr.Dataset:
