@@ -123,7 +123,7 @@ def fit_window_plainly(
     excess = np.maximum(quantization - 1, 0) * bare[:, 0] / bare[:, 1]
     # one sample of jumps across gaps at all averaging times; pairs of clusters that are left out
     jumps = bare[:, 0] * np.sqrt(2 * np.maximum(quantization - 1, 0) / tables.weight[ok])
-    thinned = np.minimum(quantization, 1) ** 2 / factor * tables.diagonal[ok, 14] * (white > 1)
+    thinned = np.minimum(quantization, 1) ** 2 / factor * tables.diagonal[14, ok] * (white > 1)
     thinned *= tables.to_samples[0] ** 2
     z = y - part[:, 0] * trend[4]
 

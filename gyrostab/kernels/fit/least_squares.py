@@ -321,7 +321,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
         Squared coefficient to sample units.
     pairs : float64 (4, 4, n_tau, n_tau); ramps : float64 (4, n_tau, n_tau)
         `detrend_tables`, or `product_tables` if a ramp is not fitted.
-    diagonal : float64 (n_tau, 15)
+    diagonal : float64 (15, n_tau)
         Result of `combine_diagonal`.
     weight : float64 (n_tau,)
         Degrees of freedom for white noise, the weights of the first pass.
@@ -352,6 +352,7 @@ def fit_windows(  # type: ignore[no-untyped-def]
     augmented, products = eights(size * (size + WIDTH)), eights(10 * PRODUCTS)
     chi2, valid, squares = eights(_ONE), np.empty(PLACES, np.int64), np.empty(5)
     start, stochastic = np.empty(4), allowed & 15
+    terms = np.ascontiguousarray(columns.T)
     for first in range(0, n_windows, PLACES):
         _observe_eight(first, curves, columns, to_samples, cells, trend, valid)
         describe_gaps(columns, to_samples, diagonal, cells)
@@ -373,5 +374,5 @@ def fit_windows(  # type: ignore[no-untyped-def]
             average_submodels(allowed, start, cells.trend[4, place], low_sigma, room, result[w])
             for a in range(5):
                 squares[a] = result[w, 0, a] if result[w, 0, a] > 0.0 else 0.0
-            degrees_of_freedom(squares, curves, w, columns, to_samples, diagonal, dof[w])
+            degrees_of_freedom(squares, curves, w, terms, to_samples, diagonal, dof[w])
     return result, misfit, dof

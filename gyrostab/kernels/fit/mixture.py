@@ -120,10 +120,10 @@ def describe_gaps(columns, to_samples, diagonal, cells):  # type: ignore[no-unty
     this adds to single cells goes to ``cells.thinned``.
     """
     for i in range(columns.shape[0]):
-        white_jump = columns[i, 0] / columns[i, 1] * to_samples[1] * diagonal[i, 5]
+        white_jump = columns[i, 0] / columns[i, 1] * to_samples[1] * diagonal[5, i]
         put(cells.jumps, i, root(take(cells.responses, WIDTH * i + 2) * white_jump))
         own = take(cells.responses, WIDTH * i)
-        thinned = own * own * diagonal[i, 14] * take(cells.inverse, i)
+        thinned = own * own * diagonal[14, i] * take(cells.inverse, i)
         white = take(cells.responses, WIDTH * i + 1)  # above that of unbroken runs for clusters
         put(cells.thinned, i, where_above(white, to_samples[1], thinned, 0.0))
 
