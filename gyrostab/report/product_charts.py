@@ -16,13 +16,14 @@ from gyrostab.arrays import Floats
 from gyrostab.noise import LAWS
 from gyrostab.plot.adev import fitted_curves
 from gyrostab.plot.coefficients import find_shown_values
-from gyrostab.plot.style import axis_names, axis_style, unit_label, unit_of_time, unit_symbol
+from gyrostab.plot.style import axis_names, axis_style, unit_symbol
 from gyrostab.report.charts import (
     DEVIATION_LABEL,
     SYMBOLS,
     TAU_LABEL,
     TIME_AXIS,
     Chart,
+    add_channel,
     decade_bar,
     embeddable,
     gap_shapes,
@@ -35,6 +36,7 @@ from gyrostab.report.charts import (
     stacked_panels,
 )
 from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY
+from gyrostab.time.durations import largest_unit
 from gyrostab.time.stamps import label_stamp
 
 if TYPE_CHECKING:
@@ -202,16 +204,7 @@ def _draw_coefficients(product: xr.Dataset, gaps: list[dict[str, Any]]) -> go.Fi
         label_panel(figure, panel, f"{symbol}, {LAWS[symbol].name} [{label}]")
         _add_coefficient(figure, product, symbol, panel, label)
     for row, name in enumerate(channels, start=len(LAWS)):
-        unit = unit_label(product[name].attrs.get("units"))
-        label_panel(figure, f"y{row + 1}", plain_text(f"{name.replace('_', ' ')} {unit}"))
-        figure.add_scatter(
-            x=milliseconds(product),
-            y=single(product[name].values),
-            yaxis=f"y{row + 1}",
-            name=plain_text(name.replace("_", " ")),
-            line={"color": "#404040", "width": 1.5},
-            showlegend=False,
-        )
+        add_channel(figure, row, name, milliseconds(product), product[name], colour="#404040")
     return figure
 
 
@@ -311,7 +304,7 @@ def _draw_surface(product: xr.Dataset) -> go.Figure:
     values = _log_deviation(product)
     # from the first window, because WebGL computes with 32 bits
     seconds = (milliseconds(product) - milliseconds(product)[0]) / 1e3
-    size, unit = unit_of_time(float(seconds[-1]))
+    size, unit = largest_unit(float(seconds[-1]) / 3)
     figure = new_chart(
         scene={
             "xaxis": {"title": {"text": f"time [{unit}]"}},
