@@ -34,3 +34,4 @@ from gyrostab.schema.variables import SIGNAL_UNITS as SIGNAL_UNITS
 from gyrostab.schema.variables import UPPER_LIMIT_ONLY as UPPER_LIMIT_ONLY
 from gyrostab.schema.variables import VARIABLES as VARIABLES
 from gyrostab.schema.variables import attributes as attributes
+from gyrostab.schema.variables import flag_attributes as flag_attributes
