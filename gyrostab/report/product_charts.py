@@ -35,7 +35,7 @@ from gyrostab.report.charts import (
     single,
     stacked_panels,
 )
-from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY
+from gyrostab.schema import split_coefficient
 from gyrostab.time.durations import largest_unit
 from gyrostab.time.stamps import label_stamp
 
@@ -212,7 +212,7 @@ def _add_coefficient(
     figure: go.Figure, product: xr.Dataset, symbol: str, panel: str, label: str
 ) -> None:
     """Add estimates as points with standard errors, and upper limits as open arrows."""
-    state = product["observable"].sel(term=symbol).values
+    values, limits = split_coefficient(product, symbol)
     shown = find_shown_values(product, symbol)
     is_wide = shown.size > 0 and shown.max() > 10 * shown.min()  # than a decade
     scale = log_axis("", shown, labels=5) if is_wide else {"rangemode": "tozero"}
@@ -220,23 +220,19 @@ def _add_coefficient(
     for row, name in enumerate(axis_names(product)):
         colour = axis_style(product, name)["color"]
         shared = {"x": milliseconds(product), "yaxis": panel, "legendgroup": name}
-        limits = np.where(
-            state[row] == UPPER_LIMIT_ONLY, product[f"{symbol}_upper"].values[row], np.nan
-        )
-        if np.isfinite(limits).any():
+        if np.isfinite(limits[row]).any():
             figure.add_scatter(
                 **shared,
-                y=single(limits),
+                y=single(limits[row]),
                 mode="markers",
                 name=f"axis {plain_text(name)}, upper limit",
                 marker={"color": colour, "symbol": "arrow-bar-down-open", "size": 8},
                 hovertemplate=f"< %{{y:.3g}} {label}",
                 showlegend=False,
             )
-        values = np.where(state[row] == OBSERVED, product[symbol].values[row], np.nan)
         figure.add_scatter(
             **shared,
-            y=single(values),
+            y=single(values[row]),
             error_y={
                 "array": single(product[f"{symbol}_stderr"].values[row]),
                 "color": colour,
