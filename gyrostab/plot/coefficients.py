@@ -113,8 +113,8 @@ def _draw_axis(
     marks = style | {"markersize": 3.5 if few else 2.5, "linewidth": 1.0}
     panel.plot(time, value, **(marks if few else marks | {"marker": ""}), label=name)
     if not few:  # a single point does not make a line
-        is_finite = np.concatenate([[False], np.isfinite(value), [False]])
-        single = is_finite[1:-1] & ~is_finite[:-2] & ~is_finite[2:]
+        first, end = find_runs(np.isfinite(value))
+        single = first[end - first == 1]
         panel.plot(time[single], value[single], **marks | {"linestyle": "none", "markersize": 2.0})
     if few:
         panel.errorbar(

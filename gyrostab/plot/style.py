@@ -272,8 +272,8 @@ def time_axis(ax: Axes, times: Array) -> None:
 
 def find_runs(mask: Array) -> tuple[Array, Array]:
     """Find the first index of each run of True, and the index after its last."""
-    steps = np.diff(np.concatenate([[0], mask.astype(int), [0]]))
-    return np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)
+    edges = np.flatnonzero(np.diff(mask, prepend=False, append=False))
+    return edges[::2], edges[1::2]
 
 
 def shade_spans(

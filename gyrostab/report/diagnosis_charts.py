@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.arrays import Floats
 from gyrostab.noise import NORMAL_95
-from gyrostab.plot.style import COLOURS, axis_names, axis_style
+from gyrostab.plot.style import COLOURS, axis_names, axis_style, find_runs
 from gyrostab.plot.surface import CHANGE_CMAP
 from gyrostab.report.charts import (
     DEVIATION_LABEL,
@@ -180,9 +180,8 @@ def _band_outline(x: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats]
     ([0.0, 1.0, 1.0, 0.0, 0.0, 3.0, 3.0, 3.0], [0.0, 0.0, 1.0, 1.0, nan, 0.0, 1.0, nan])
     """
     present = np.isfinite(low) & np.isfinite(high)
-    ends = np.flatnonzero(np.diff(present, prepend=False, append=False)).reshape(-1, 2)
     place, edge = [x[:0]], [low[:0]]
-    for part in (slice(*pair) for pair in ends):
+    for part in map(slice, *find_runs(present)):
         place += [x[part], x[part][::-1], x[part][:1]]
         edge += [low[part], high[part][::-1], np.full(1, np.nan)]
     return np.concatenate(place), np.concatenate(edge)
