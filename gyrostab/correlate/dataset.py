@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from gyrostab.correlate.drivers import Driver, slope_units
 from gyrostab.correlate.judge import LIMITS, VERDICTS, slope_label
 from gyrostab.errors import OptionError
 from gyrostab.noise import TERMS
+from gyrostab.schema import flag_attributes
 
 # Key of the entry, long name and units of each variable.
 _STATISTICS = {
@@ -80,11 +80,10 @@ def assemble(
     shape = (product.sizes["axis"], len(names), len(drivers))
     dims = ("axis", "variable", "driver")
 
+    ordered = [entries[place] for place in np.ndindex(shape)]
+
     def table(key: str, dtype: Any = np.float64) -> Any:
-        out = np.empty(shape, dtype=dtype)
-        for place, entry in entries.items():
-            out[place] = entry[key]
-        return out
+        return np.array([entry[key] for entry in ordered], dtype).reshape(shape)
 
     copied = [*names, *(["observable"] if set(names) & set(TERMS) else [])]
     result = (
@@ -103,16 +102,17 @@ def assemble(
         table("windows", np.int32),
         {"long_name": "windows used", "units": "1"},
     )
-    flags = {
-        "flag_values": np.arange(len(VERDICTS), dtype=np.int8),
-        "flag_meanings": " ".join(VERDICTS),
+    label = "what the record shows about the coupling"
+    verdict_attrs = {"long_name": label, **flag_attributes(VERDICTS)}
+    made["coupling_verdict"] = (dims, table("verdict", np.int8), verdict_attrs)
+    masks = {name: 1 << bit for bit, name in enumerate(LIMITS)}
+    bits = [sum(masks[name] for name in entry["limits"]) for entry in ordered]
+    limit_attrs = {
+        "long_name": "what limits the verdict",
+        "flag_masks": np.array(list(masks.values()), np.int16),
+        "flag_meanings": " ".join(masks),
     }
-    made["coupling_verdict"] = (
-        dims,
-        table("verdict", np.int8),
-        {"long_name": "what the record shows about the coupling", **flags},
-    )
-    made["coupling_limits"] = (dims, *_limit_flags(shape, entries))
+    made["coupling_limits"] = (dims, np.array(bits, np.int16).reshape(shape), limit_attrs)
     for v, name in enumerate(names):
         for d, driver in enumerate(drivers):
             attributes = {
@@ -130,7 +130,7 @@ def assemble(
                 )
     made["statement"] = (
         dims,
-        table("statement", object).astype(str),
+        table("statement", str),
         {"long_name": "result in one sentence"},
     )
     result = result.assign(made)
@@ -151,21 +151,6 @@ def assemble(
         "interval_level": level,
     }
     return result.assign_attrs(longest_lag_s=longest)
-
-
-def _limit_flags(
-    shape: tuple[int, ...], entries: Mapping[tuple[int, int, int], Mapping[str, Any]]
-) -> tuple[Any, dict[str, Any]]:
-    """Set one bit for each limit of a verdict, with the attributes that name the bits."""
-    masks = {name: np.int16(1 << bit) for bit, name in enumerate(LIMITS)}
-    bits = np.zeros(shape, np.int16)
-    for place, entry in entries.items():
-        bits[place] = sum(int(masks[name]) for name in entry["limits"])
-    meanings = {
-        "flag_masks": np.array(list(masks.values()), np.int16),
-        "flag_meanings": " ".join(masks),
-    }
-    return bits, {"long_name": "what limits the verdict", **meanings}
 
 
 def join(product: xr.Dataset, result: xr.Dataset) -> xr.Dataset:

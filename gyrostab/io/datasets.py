@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
@@ -108,7 +108,7 @@ def to_netcdf(
     np.datetime64('1970-01-01T00:00:00.003333333')
     """
     stored, sources = _encode_dataset(dataset, "to_netcdf", stamps)
-    plan = partial(_netcdf_encoding, filters=_make_filters(compression))
+    plan = partial(_plan_netcdf, filters=_make_filters(compression))
     output = partial(new_output, path, overwrite=overwrite, inputs=sources)
     _write_counts(stored, output, plan, _begin_netcdf, partial(append_netcdf, progress=progress))
     return Path(path)
@@ -149,23 +149,15 @@ def _begin_netcdf(dataset: xr.Dataset, path: Path, encoding: dict[Any, dict[str,
         store.close()
 
 
-def _netcdf_encoding(stored: xr.Dataset, filters: dict[str, Any]) -> dict[Any, dict[str, Any]]:
+def _plan_netcdf(stored: xr.Dataset, filters: dict[str, Any]) -> dict[Any, dict[str, Any]]:
     import netCDF4
 
-    encoding: dict[Any, dict[str, Any]] = {}
+    encoding = _plan_encoding(stored, netCDF4.default_fillvals.__getitem__, chunks="chunksizes")
     for name, variable in stored.variables.items():
-        text = variable.dtype.kind in "OUST"
-        encoding[name] = (
-            {}
-            if "_FillValue" in variable.attrs
-            else {"_FillValue": None, **({"dtype": "S1"} if text else {})}
-        )
-        if _is_data(stored, name) and variable.dtype.kind == "f":
-            encoding[name]["_FillValue"] = variable.dtype.type(
-                netCDF4.default_fillvals[variable.dtype.str[1:]]
-            )
-        if variable.ndim and variable.size and not text:
-            encoding[name] |= {**filters, "chunksizes": _plan_chunks(variable, _find_rate(stored))}
+        if variable.dtype.kind in "OUST":
+            encoding[name] = {"_FillValue": None, "dtype": "S1"}
+        elif "chunksizes" in encoding[name]:
+            encoding[name] |= filters
             if _has_rule(variable):  # both ends are read whenever the file is opened
                 encoding[name]["chunksizes"] = (min(variable.size, _STAMPS_PER_CHUNK),)
     return encoding
@@ -266,20 +258,33 @@ def plan_zarr(stored: xr.Dataset) -> dict[Any, dict[str, Any]]:
     """Choose chunks and compression; add a checksum to every chunk of a log, as blosc has none."""
     from numcodecs import Blosc, Fletcher32
 
+    encoding = _plan_encoding(stored, lambda _: np.nan, chunks="chunks")
+    for name, variable in stored.variables.items():
+        if "chunks" not in encoding[name]:
+            continue
+        if _has_rule(variable):  # from which they are restored: a checksum is not needed
+            encoding[name]["compressors"] = Blosc("zlib", clevel=4, shuffle=Blosc.SHUFFLE)
+        elif _find_rate(stored) is not None and variable.dtype.kind in "if":
+            encoding[name] |= {
+                "compressors": Blosc("lz4", clevel=5, shuffle=Blosc.SHUFFLE),
+                "filters": [Fletcher32()],
+            }
+    return encoding
+
+
+def _plan_encoding(
+    stored: xr.Dataset, find_fill: Callable[[str], Any], *, chunks: str
+) -> dict[Any, dict[str, Any]]:
+    """Choose the value for missing data and, under the key `chunks`, the chunks."""
+    bounds = {variable.attrs.get("bounds") for variable in stored.variables.values()}
     encoding: dict[Any, dict[str, Any]] = {}
     for name, variable in stored.variables.items():
-        encoding[name] = {} if "_FillValue" in variable.attrs else {"_FillValue": None}
-        if _is_data(stored, name) and variable.dtype.kind == "f":
-            encoding[name]["_FillValue"] = variable.dtype.type(np.nan)
+        fill = variable.encoding.get("_FillValue")  # of counts
+        if variable.dtype.kind == "f" and name not in {*stored.coords, *bounds}:
+            fill = variable.dtype.type(find_fill(variable.dtype.str[1:]))
+        encoding[name] = {"_FillValue": fill}
         if variable.ndim and variable.size:
-            encoding[name]["chunks"] = _plan_chunks(variable, _find_rate(stored))
-            if _has_rule(variable):  # from which they are restored: a checksum is not needed
-                encoding[name]["compressors"] = Blosc("zlib", clevel=4, shuffle=Blosc.SHUFFLE)
-            elif _find_rate(stored) is not None and variable.dtype.kind in "if":
-                encoding[name] |= {
-                    "compressors": Blosc("lz4", clevel=5, shuffle=Blosc.SHUFFLE),
-                    "filters": [Fletcher32()],
-                }
+            encoding[name][chunks] = _plan_chunks(variable, _find_rate(stored))
     return encoding
 
 
@@ -333,24 +338,27 @@ def _has_rule(variable: xr.Variable) -> bool:
     return GRID in variable.attrs and variable.ndim == 1
 
 
-def _is_data(dataset: xr.Dataset, name: Any) -> bool:
-    """Whether a variable is data, not a coordinate or its bounds."""
-    bounds = {variable.attrs.get("bounds") for variable in dataset.variables.values()}
-    return name not in dataset.coords and name not in bounds
-
-
 def _plan_chunks(variable: xr.Variable, rate: float | None) -> tuple[int, ...]:
-    """Plan chunks of one axis (and one term), all tau, and much time; 20 minutes for a log."""
-    split_dims = ("axis", "term", variable.dims[-1])
-    inner = math.prod(size for dim, size in variable.sizes.items() if dim not in split_dims)
-    max_length = max(1, CHUNK_VALUES // max(1, inner))
-    if rate is not None:
-        on_time = variable.dims[-1] in ("time", index_dim("time")) and not _has_rule(variable)
-        max_length = chunk_samples(rate if on_time else 0.0)
-    last = max(1, min(variable.shape[-1], max_length))
+    """Plan the chunks of a variable; those of a log have 20 minutes."""
+    dim = variable.dims[-1]
+    if rate is None:
+        return plan_chunks(variable.sizes, dim)
+    on_time = dim in ("time", index_dim("time")) and not _has_rule(variable)
+    length = chunk_samples(rate if on_time else 0.0)
+    return plan_chunks(variable.sizes, dim, min(variable.shape[-1], length))
+
+
+def plan_chunks(sizes: Mapping[Any, int], along: Any, length: int | None = None) -> tuple[int, ...]:
+    """Plan chunks of one axis and one term that have `length` values along a dimension.
+
+    By default a chunk has at most `CHUNK_VALUES`, if that is one value along the dimension or more.
+    """
+    if length is None:
+        inner = math.prod(size for dim, size in sizes.items() if dim not in ("axis", "term", along))
+        length = max(1, min(sizes[along], CHUNK_VALUES // max(1, inner)))
     return tuple(
-        last if dim == variable.dims[-1] else 1 if dim in ("axis", "term") else size
-        for dim, size in variable.sizes.items()
+        length if dim == along else 1 if dim in ("axis", "term") else size
+        for dim, size in sizes.items()
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import SchemaError
-from gyrostab.io.datasets import begin_zarr, plan_zarr
+from gyrostab.io.datasets import begin_zarr, plan_chunks, plan_zarr
 from gyrostab.store.cf import to_disk
 from gyrostab.store.output import find_foreign_item, new_output
 
@@ -71,10 +71,7 @@ def _make_store(folder: Path, stored: xr.Dataset, chunk: int) -> None:
     encoding = plan_zarr(stored)
     for name, variable in stored.variables.items():
         if "time" in variable.dims:
-            encoding[name]["chunks"] = tuple(
-                chunk if dim == "time" else 1 if dim in ("axis", "term") else length
-                for dim, length in variable.sizes.items()
-            )
+            encoding[name]["chunks"] = plan_chunks(variable.sizes, "time", chunk)
     begin_zarr(stored, folder, encoding)
 
 

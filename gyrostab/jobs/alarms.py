@@ -14,7 +14,7 @@ import xarray as xr
 
 from gyrostab.errors import OptionError, UnitError
 from gyrostab.noise import LAWS
-from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY
+from gyrostab.schema import split_coefficient
 from gyrostab.units import INNER, Unit, parse_unit
 
 _SYNTAX = re.compile(
@@ -158,10 +158,8 @@ def describe_windows(part: xr.Dataset) -> list[dict[str, Any]]:
     """
     axes = [str(axis) for axis in part["axis"].values]
     fields = {}
-    for place, symbol in enumerate(map(str, part["term"].values)):
-        state = part["observable"].values[..., place]
-        for name, shown in ((symbol, OBSERVED), (f"{symbol}_upper", UPPER_LIMIT_ONLY)):
-            fields[name] = np.where(state == shown, part[name].values, np.nan)
+    for symbol in map(str, part["term"].values):
+        fields[symbol], fields[f"{symbol}_upper"] = split_coefficient(part, symbol)
     with np.errstate(invalid="ignore", divide="ignore"):
         fields[_MISFIT] = part["fit_chi2"].values / part["fit_dof"].values
     fields[_LOSS] = 100.0 * (1.0 - part["window_coverage"].values)

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Array
-from gyrostab.io.datasets import CHUNK_VALUES
+from gyrostab.io.datasets import plan_chunks
 from gyrostab.store.lazy import Source, make_dask
 from gyrostab.store.output import replace_file
 
@@ -148,11 +148,8 @@ def _map_variable(block: Block, name: str) -> Array:
 def _make_lazy(blocks: Sequence[Block], name: str) -> Any:
     """Make a dask array that reads a variable along time from the block files."""
     source = _BlockSource(blocks, name)
-    dims = list(zip(source.dims, source.shape, strict=True))
-    inner = math.prod(size for dim, size in dims if dim not in ("axis", "term", "time"))
-    length = max(1, min(int(source.edges[-1]), CHUNK_VALUES // max(1, inner)))
-    chunks = {"axis": 1, "term": 1, "time": length}
-    return make_dask(source, tuple(chunks.get(dim, size) for dim, size in dims))
+    sizes = dict(zip(source.dims, source.shape, strict=True))
+    return make_dask(source, plan_chunks(sizes, "time"))
 
 
 class _BlockSource(Source):

@@ -65,7 +65,7 @@ def compute_blocks(
     pool: Pool,
     call: Sequence[Any],
     check: Callable[[], None],
-    advance: Callable[[int], None],
+    advance: Callable[[], None],
 ) -> None:
     """Compute the missing parts and write each to its block file.
 
@@ -77,6 +77,8 @@ def compute_blocks(
         Function and its first arguments; the part is the last one.
     check : callable
         Raises when an input has changed. A result is written only after a later check.
+    advance : callable
+        Called whenever parts have been written.
     """
     missing = [number for number in range(len(parts)) if number not in blocks]
     held: list[tuple[int, xr.Dataset]] = []
@@ -91,7 +93,7 @@ def compute_blocks(
         while held:
             number, result = held.pop()
             blocks[number] = write_block(folder, parts[number], result, job=job)
-        advance(len(blocks))
+        advance()
         last = time.monotonic()
 
     function, *arguments = call

@@ -50,14 +50,7 @@ from gyrostab.jobs.fleet_table import (
     summarise_run,
     write_table,
 )
-from gyrostab.jobs.job import (
-    check_job_folder,
-    check_unfinished_run,
-    job_folder,
-    lock_job,
-    make_fingerprint,
-    remove_job,
-)
+from gyrostab.jobs.job import lock_output, make_fingerprint
 from gyrostab.jobs.load import check_options
 from gyrostab.jobs.run import find_job_name, read_job_name, run
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
@@ -193,39 +186,33 @@ def run_fleet(
     else:
         check_output(output, overwrite=True, find_foreign=_find_foreign)
     target = resolve_link(output)
-    check_job_folder(job_folder(target))
-    with protect_inputs(paths), lock_job(job_folder(target)):
-        if not overwrite:
-            check_unfinished_run(job_folder(target), output=target)
-        try:
-            archive, known_table = open_archive(paths, target)
-            given_options = {**make_fingerprint([], options)["options"], "per": per}
-            if not overwrite and any(not row["error"] for row in read_rows(target).values()):
-                check_update(
-                    output,
-                    archive,
-                    given_options,
-                    known_table=read_table(target / "files.parquet", content=FILES),
-                    known_options=read_options(target),
-                )
-            begin_output(target, given_options, reports=reports)
-            with _open_workers(scheduler, workers, [target, *archive.files[:1]]) as pool:
-                table = index_files(
-                    archive, reading=options["reading"], known=known_table, pool=pool, stage=stage
-                )
-                write_table(table, target / "files.parquet", content=FILES, overwrite=True)
-                runs = find_runs(archive, table, per=per, tool=tool)
-                rows = _compute_runs(
-                    target,
-                    runs,
-                    options,
-                    reports=reports,
-                    overwrite=overwrite,
-                    pool=pool,
-                    stage=stage,
-                )
-        finally:
-            remove_job(job_folder(target), output=target)
+    with protect_inputs(paths), lock_output(target, overwrite=overwrite):
+        archive, known_table = open_archive(paths, target)
+        given_options = {**make_fingerprint([], options)["options"], "per": per}
+        if not overwrite and any(not row["error"] for row in read_rows(target).values()):
+            check_update(
+                output,
+                archive,
+                given_options,
+                known_table=read_table(target / "files.parquet", content=FILES),
+                known_options=read_options(target),
+            )
+        begin_output(target, given_options, reports=reports)
+        with _open_workers(scheduler, workers, [target, *archive.files[:1]]) as pool:
+            table = index_files(
+                archive, reading=options["reading"], known=known_table, pool=pool, stage=stage
+            )
+            write_table(table, target / "files.parquet", content=FILES, overwrite=True)
+            runs = find_runs(archive, table, per=per, tool=tool)
+            rows = _compute_runs(
+                target,
+                runs,
+                options,
+                reports=reports,
+                overwrite=overwrite,
+                pool=pool,
+                stage=stage,
+            )
     failed = rows[rows["error"] != ""]
     for row in failed.to_dict("records"):
         warnings.warn(f"{row['run']}: {row['error']}", stacklevel=2)

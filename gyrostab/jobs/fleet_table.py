@@ -194,10 +194,11 @@ def make_table(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) ->
         for item in runs
     }
     diagnosed = {
-        item.name: (item.verdict, escape_text(full_name(item.diagnosis)))
+        item.name: {"verdict": item.verdict, "diagnosis": escape_text(full_name(item.diagnosis))}
         for item in runs
         if item.diagnosis
     }
+    without = {"verdict": "", "diagnosis": ""}
     first = ("run", "tool", "error", "files", "start", "end", "span [s]", "rate [Hz]", "windows")
     return pd.DataFrame(
         [
@@ -205,7 +206,7 @@ def make_table(rows: Mapping[str, Mapping[str, Any]], runs: Sequence[LogRun]) ->
                 **dict.fromkeys(first),
                 **rows[name],
                 **present.get(name, {}),
-                **dict(zip(("verdict", "diagnosis"), diagnosed.get(name, ("", "")), strict=True)),
+                **diagnosed.get(name, without),
             }
             for name in sorted(rows)
         ],

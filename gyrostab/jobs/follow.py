@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import re
 import threading
 from collections.abc import Callable
@@ -144,13 +145,8 @@ class RowKeeper:
 
 def _read_header(path: Path) -> bytes:
     """Read the lines before the first data row of a file of rows."""
-    lines = []
     with path.open("rb") as file:
-        for line in file:
-            if _DATA_ROW.match(line):
-                break
-            lines.append(line)
-    return b"".join(lines)
+        return b"".join(itertools.takewhile(lambda line: not _DATA_ROW.match(line), file))
 
 
 def hash_samples(log: xr.Dataset, span: tuple[int, int], common: str) -> bytes:

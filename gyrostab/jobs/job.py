@@ -29,6 +29,7 @@ from gyrostab.store.output import (
     hide_name,
     is_leftover,
     remove_leftovers,
+    resolve_link,
     write_text,
 )
 from gyrostab.store.output.content import read_json
@@ -316,6 +317,30 @@ def check_unfinished_run(folder: Path, *, output: Path) -> None:
             f"{count_finished_parts(folder)} of {job['parts']} parts are kept, and gyrostab run "
             "with --resume continues it; give another name with -o, or --overwrite to discard them"
         )
+
+
+@contextlib.contextmanager
+def lock_output(output: Path, *, overwrite: bool) -> Iterator[None]:
+    """Lock the job folder of an output that is made without block files, and remove it at the end.
+
+    Raises
+    ------
+    OutputError
+        As for `check_job_folder`.
+    ResumeError
+        When there is an unfinished run of the output without `overwrite`, or another process works
+        on it.
+    """
+    target = resolve_link(output)
+    folder = job_folder(target)
+    check_job_folder(folder)
+    with lock_job(folder):
+        if not overwrite:
+            check_unfinished_run(folder, output=output)
+        try:
+            yield
+        finally:
+            remove_job(folder, output=target)
 
 
 def clear_job(folder: Path) -> None:

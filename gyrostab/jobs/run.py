@@ -304,14 +304,9 @@ def _compute_missing(
         log.sizes["axis"] if axis is None else 1 if isinstance(axis, str) else len(axis)
     )
 
-    def advance(count: int) -> None:
-        stage(
-            "computing",
-            total,
-            total
-            * sum(block.part.stop - block.part.start for block in blocks.values())
-            // parts[-1].stop,
-        )
+    def advance() -> None:
+        done = sum(block.part.stop - block.part.start for block in blocks.values())
+        stage("computing", total, total * done // parts[-1].stop)
 
     if len(blocks) < len(parts):
         fitting = find_record_bands(log, windows, fitting)
@@ -329,7 +324,7 @@ def _compute_missing(
             log = load_log([to_zarr(log, job.folder / "log.zarr", stamps=False)])
         copy = zlib.compress(pickle.dumps(log), level=1)  # holds names and places, not samples
         call = (_compute_part_of_copy, pool.share(copy), windows, fitting)
-    advance(0)
+    advance()
     compute_blocks(
         job.folder,
         parts,

@@ -30,20 +30,12 @@ from gyrostab.io.opening import open_product
 from gyrostab.jobs.alarms import Alarm, check_alarms, describe_windows
 from gyrostab.jobs.engine import compute_part, find_record_bands
 from gyrostab.jobs.follow import FileMemory, FileStates, RowKeeper, hash_samples, list_files
-from gyrostab.jobs.job import (
-    check_job_folder,
-    check_unfinished_run,
-    describe_differences,
-    job_folder,
-    lock_job,
-    make_fingerprint,
-    remove_job,
-)
+from gyrostab.jobs.job import describe_differences, lock_output, make_fingerprint
 from gyrostab.jobs.load import check_options, load_log
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.schema import escape_text, log_channels, signal_name, texts
 from gyrostab.store.lazy import find_source
-from gyrostab.store.output import check_output, follow_inputs, resolve_link
+from gyrostab.store.output import check_output, protect_inputs
 from gyrostab.store.remote import find_url, full_name
 from gyrostab.store.system import release_memory, return_large_arrays
 from gyrostab.time.durations import duration_seconds, samples
@@ -148,38 +140,31 @@ def watch(
     wait = duration_seconds(lateness, "--lateness") if lateness else 0.0
     quiet = duration_seconds(idle, "--idle") if idle else np.inf
     path = Path(output)
-    with follow_inputs([] if source == "-" else [source]):
+    with protect_inputs([] if source == "-" else [source], growing=True):
         identity = make_fingerprint([], options)
         identity["inputs"] = [{"path": source if source == "-" else full_name(source)}]
         place = str(rows_folder(path)) if source == "-" else source
         until = _continue_product(path, place, identity, overwrite=overwrite)
-        folder = job_folder(resolve_link(path))
-        check_job_folder(folder)
-        with lock_job(folder):
-            if not overwrite:
-                check_unfinished_run(folder, output=path)
-            try:
-                keeper = None
-                if source == "-":
-                    if overwrite and rows_folder(path).exists():
-                        raise OutputError(
-                            f"{rows_folder(path)} holds the rows of an earlier live view, which a "
-                            "new one would include; move or remove that folder, or give another "
-                            "name with -o"
-                        )
-                    if until is None and (earlier_files := list_files(place)):
-                        count = len(earlier_files)
-                        listener.show_note(
-                            f"{place} holds the rows of an earlier live view ({count} "
-                            f"file{'s' * (count > 1)}), which are part of this one; stop, and move "
-                            "that folder, if they should not be"
-                        )
-                    keeper = RowKeeper(stream or sys.stdin.buffer, rows_folder(path))
-                attrs = {_IDENTITY: json.dumps(identity)}
-                view = _View(path, options, attrs, wait, alarms, listener, until)
-                _follow_source(view, place, keeper, quiet, poll)
-            finally:
-                remove_job(folder, output=resolve_link(path))
+        with lock_output(path, overwrite=overwrite):
+            keeper = None
+            if source == "-":
+                if overwrite and rows_folder(path).exists():
+                    raise OutputError(
+                        f"{rows_folder(path)} holds the rows of an earlier live view, which a new "
+                        "one would include; move or remove that folder, or give another name with "
+                        "-o"
+                    )
+                if until is None and (earlier_files := list_files(place)):
+                    count = len(earlier_files)
+                    listener.show_note(
+                        f"{place} holds the rows of an earlier live view ({count} "
+                        f"file{'s' * (count > 1)}), which are part of this one; stop, and move "
+                        "that folder, if they should not be"
+                    )
+                keeper = RowKeeper(stream or sys.stdin.buffer, rows_folder(path))
+            attrs = {_IDENTITY: json.dumps(identity)}
+            view = _View(path, options, attrs, wait, alarms, listener, until)
+            _follow_source(view, place, keeper, quiet, poll)
     return path
 
 

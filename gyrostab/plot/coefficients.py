@@ -30,7 +30,7 @@ from gyrostab.plot.style import (
     write_in_middle,
 )
 from gyrostab.plot.surface import find_time_edges
-from gyrostab.schema import NOT_OBSERVABLE, OBSERVED, UPPER_LIMIT_ONLY, with_axis
+from gyrostab.schema import NOT_OBSERVABLE, OBSERVED, UPPER_LIMIT_ONLY, split_coefficient, with_axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -107,16 +107,14 @@ def _draw_axis(
     panel: Axes, part: xr.Dataset, symbol: str, name: str, style: dict[str, Any]
 ) -> None:
     time = part["time"].values
-    state = part["observable"].sel(term=symbol).values
-    value = np.where(state == OBSERVED, part[symbol].values, np.nan)
-    error = np.where(state == OBSERVED, part[f"{symbol}_stderr"].values, np.nan)
-    upper = np.where(state == UPPER_LIMIT_ONLY, part[f"{symbol}_upper"].values, np.nan)
+    value, upper = split_coefficient(part, symbol)
+    error = part[f"{symbol}_stderr"].values
     few = time.size <= 80
     marks = style | {"markersize": 3.5 if few else 2.5, "linewidth": 1.0}
     panel.plot(time, value, **(marks if few else marks | {"marker": ""}), label=name)
     if not few:  # a single point does not make a line
-        is_finite = np.concatenate([[False], np.isfinite(value), [False]])
-        single = is_finite[1:-1] & ~is_finite[:-2] & ~is_finite[2:]
+        first, end = find_runs(np.isfinite(value))
+        single = first[end - first == 1]
         panel.plot(time[single], value[single], **marks | {"linestyle": "none", "markersize": 2.0})
     if few:
         panel.errorbar(
@@ -162,12 +160,7 @@ def _set_scale(panel: Axes, product: xr.Dataset, symbol: str, names: list[str]) 
 
 def find_shown_values(product: xr.Dataset, symbol: str) -> Array:
     """Find the values and upper limits of a term that figures show, if they are above zero."""
-    state = product["observable"].sel(term=symbol).values
-    shown = (
-        product[symbol].values[state == OBSERVED],
-        product[f"{symbol}_upper"].values[state == UPPER_LIMIT_ONLY],
-    )
-    numbers = np.concatenate(shown)
+    numbers = np.stack(split_coefficient(product, symbol))
     return np.asarray(numbers[np.isfinite(numbers) & (numbers > 0)])
 
 

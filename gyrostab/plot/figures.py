@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,25 +34,25 @@ def product_figures(
     two windows and two averaging times).
     """
     check_product(product)
-    drivers = product["driver"].values if "driver" in product.coords else ()
-    figures: dict[str, Callable[[], Figure]] = {
-        "coefficients": lambda: plot_coefficients(product, width=width),
-        "davar": lambda: plot_davar(product, width=width),
-        "davar_change": lambda: plot_davar(product, relative=True, width=width),
+    figures: dict[str, Callable[..., Figure]] = {
+        "coefficients": partial(plot_coefficients, product),
+        "davar": partial(plot_davar, product),
+        "davar_change": partial(plot_davar, product, relative=True),
     }
     if "temperature" in product and product["temperature"].dims == ("time",):
-        figures["temperature"] = lambda: plot_correlation(
-            product if "temperature" in drivers else correlate(product),
-            driver="temperature",
-            width=width,
-        )
+        figures["temperature"] = partial(_plot_temperature, product)
     for axis in axis_names(product):
-        figures[f"adev_{axis}"] = lambda axis=axis: plot_adev(product, axis, width=width)  # type: ignore[misc]
+        figures[f"adev_{axis}"] = partial(plot_adev, product, axis)
         if min(product.sizes["time"], product.sizes["tau"]) > 1:
-            figures[f"davar_3d_{axis}"] = lambda axis=axis: plot_davar_3d(
-                product, axis=axis, width=width
-            )  # type: ignore[misc]
-    return figures
+            figures[f"davar_3d_{axis}"] = partial(plot_davar_3d, product, axis=axis)
+    return {name: partial(draw, width=width) for name, draw in figures.items()}
+
+
+def _plot_temperature(product: xr.Dataset, *, width: float) -> Figure:
+    """Draw the correlation with temperature: that of the product, or a new one."""
+    drivers = product["driver"].values if "driver" in product.coords else ()
+    correlation = product if "temperature" in drivers else correlate(product)
+    return plot_correlation(correlation, driver="temperature", width=width)
 
 
 def save_figures(

@@ -16,7 +16,7 @@ from gyrostab.arrays import Array
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.schema import check_coefficients, require_dataset
 from gyrostab.time.durations import format_duration
-from gyrostab.units import DAY, HOUR, INNER
+from gyrostab.units import INNER
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -92,24 +92,6 @@ def unit_label(units: Any) -> str:
     """
     text = unit_symbol(units)
     return f"[{text}]" if text else ""
-
-
-def unit_of_time(seconds: float) -> tuple[float, str]:
-    """Choose the largest unit that is at most a third of a length of time: seconds and name.
-
-    Examples
-    --------
-    >>> unit_of_time(7200.0)
-    (60.0, 'min')
-    """
-    return next(
-        (
-            (size, name)
-            for size, name in ((DAY, "d"), (HOUR, "h"), (60.0, "min"))
-            if seconds >= 3 * size
-        ),
-        (1.0, "s"),
-    )
 
 
 def log_edges(values: Array) -> Array:
@@ -290,8 +272,8 @@ def time_axis(ax: Axes, times: Array) -> None:
 
 def find_runs(mask: Array) -> tuple[Array, Array]:
     """Find the first index of each run of True, and the index after its last."""
-    steps = np.diff(np.concatenate([[0], mask.astype(int), [0]]))
-    return np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)
+    edges = np.flatnonzero(np.diff(mask, prepend=False, append=False))
+    return edges[::2], edges[1::2]
 
 
 def shade_spans(

@@ -22,10 +22,10 @@ from gyrostab.plot.style import (
     new_figure,
     time_axis,
     title_figure,
-    unit_of_time,
     window_text,
 )
 from gyrostab.schema import ESTIMATORS, check_surface, with_axis
+from gyrostab.time.durations import largest_unit
 from gyrostab.time.stamps import to_nanoseconds
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ def plot_davar_3d(
     ((deviation, _),), merged = _merge_windows(product, [name], columns)
     time = product["time"].values
     seconds = (time[::merged] - time[0]) / np.timedelta64(1, "s")
-    size, unit = unit_of_time(seconds[-1])
+    size, unit = largest_unit(seconds[-1] / 3)
     figure = new_figure(width / INCH_MM, 0.8 + 0.6 * width / INCH_MM)
     panel: Any = figure.add_subplot(projection="3d")
     x, y = np.meshgrid(seconds / size, np.log10(product["tau"].values), indexing="ij")

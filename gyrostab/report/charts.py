@@ -14,6 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.arrays import Floats
+from gyrostab.plot.style import unit_label
 from gyrostab.time.stamps import to_nanoseconds
 
 if TYPE_CHECKING:
@@ -180,3 +181,27 @@ def label_panel(figure: go.Figure, panel: str, text: str) -> None:
     """Write above the left end of a panel what it shows."""
     place = {"xref": "paper", "x": 0.0, "xanchor": "left", "yref": f"{panel} domain", "y": 1.0}
     figure.add_annotation(text=text, yanchor="bottom", showarrow=False, font_size=12, **place)
+
+
+def add_channel(
+    figure: go.Figure,
+    row: int,
+    name: str,
+    times: Floats,
+    channel: xr.DataArray,
+    *,
+    colour: str,
+    **look: Any,
+) -> None:
+    """Draw a channel over time [ms since 1970] in a panel that shows nothing else."""
+    words, unit = name.replace("_", " "), unit_label(channel.attrs.get("units"))
+    label_panel(figure, f"y{row + 1}", plain_text(f"{words} {unit}"))
+    figure.add_scatter(
+        x=times,
+        y=single(channel.values),
+        yaxis=f"y{row + 1}",
+        name=plain_text(words),
+        line={"color": colour, "width": 1.5},
+        showlegend=False,
+        **look,
+    )

@@ -10,13 +10,14 @@ import xarray as xr
 
 from gyrostab.arrays import Floats
 from gyrostab.noise import NORMAL_95
-from gyrostab.plot.style import COLOURS, axis_names, axis_style, unit_label
+from gyrostab.plot.style import COLOURS, axis_names, axis_style, find_runs
 from gyrostab.plot.surface import CHANGE_CMAP
 from gyrostab.report.charts import (
     DEVIATION_LABEL,
     SYMBOLS,
     TAU_LABEL,
     Chart,
+    add_channel,
     embeddable,
     label_panel,
     log_axis,
@@ -179,9 +180,8 @@ def _band_outline(x: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats]
     ([0.0, 1.0, 1.0, 0.0, 0.0, 3.0, 3.0, 3.0], [0.0, 0.0, 1.0, 1.0, nan, 0.0, 1.0, nan])
     """
     present = np.isfinite(low) & np.isfinite(high)
-    ends = np.flatnonzero(np.diff(present, prepend=False, append=False)).reshape(-1, 2)
     place, edge = [x[:0]], [low[:0]]
-    for part in (slice(*pair) for pair in ends):
+    for part in map(slice, *find_runs(present)):
         place += [x[part], x[part][::-1], x[part][:1]]
         edge += [low[part], high[part][::-1], np.full(1, np.nan)]
     return np.concatenate(place), np.concatenate(edge)
@@ -224,13 +224,7 @@ def _draw_means(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
             )  # fmt: skip
     for row, channel in enumerate(channels, start=len(names)):
         course = surfaces[f"channel_{channel}"]
-        unit = unit_label(course.attrs.get("units"))
-        label_panel(figure, f"y{row + 1}", plain_text(f"{channel.replace('_', ' ')} {unit}"))
-        figure.add_scatter(
-            x=block, y=single(course.values), yaxis=f"y{row + 1}", mode="lines",
-            name=plain_text(channel.replace("_", " ")), line={"color": COLOURS[2], "width": 1.5},
-            showlegend=False,
-        )  # fmt: skip
+        add_channel(figure, row, channel, block, course, colour=COLOURS[2], mode="lines")
     return figure
 
 

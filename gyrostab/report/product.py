@@ -186,20 +186,15 @@ def _list_facts(product: xr.Dataset) -> list[tuple[str, str]]:
         ("Averaging times", f"{tau.size}, from {shortest} to {longest}"),
         ("Windows", str(product.sizes["time"])),
     ]
-    timed = {"window_s": "Window", "step_s": "Step"}
     facts += [
         (label, format_duration(float(attrs[name]), " "))
-        for name, label in timed.items()
+        for name, label in (("window_s", "Window"), ("step_s", "Step"))
         if name in attrs
     ]
     if "sampling_rate_hz" in attrs:
         facts.append(("Sampling rate", f"{float(attrs['sampling_rate_hz']):g} Hz"))
-    plain = {"kind": "Kind of signal"}
-    facts += [
-        (label, str(attrs[name]).replace("_", " "))
-        for name, label in plain.items()
-        if name in attrs
-    ]
+    if "kind" in attrs:
+        facts.append(("Kind of signal", str(attrs["kind"]).replace("_", " ")))
     labels = ("no estimate", "from complete differences", "from incomplete (weighted) clusters")
     estimator = product["estimator"].values
     shares = [

@@ -16,13 +16,14 @@ from gyrostab.arrays import Floats
 from gyrostab.noise import LAWS
 from gyrostab.plot.adev import fitted_curves
 from gyrostab.plot.coefficients import find_shown_values
-from gyrostab.plot.style import axis_names, axis_style, unit_label, unit_of_time, unit_symbol
+from gyrostab.plot.style import axis_names, axis_style, unit_symbol
 from gyrostab.report.charts import (
     DEVIATION_LABEL,
     SYMBOLS,
     TAU_LABEL,
     TIME_AXIS,
     Chart,
+    add_channel,
     decade_bar,
     embeddable,
     gap_shapes,
@@ -34,7 +35,8 @@ from gyrostab.report.charts import (
     single,
     stacked_panels,
 )
-from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY
+from gyrostab.schema import split_coefficient
+from gyrostab.time.durations import largest_unit
 from gyrostab.time.stamps import label_stamp
 
 if TYPE_CHECKING:
@@ -202,16 +204,7 @@ def _draw_coefficients(product: xr.Dataset, gaps: list[dict[str, Any]]) -> go.Fi
         label_panel(figure, panel, f"{symbol}, {LAWS[symbol].name} [{label}]")
         _add_coefficient(figure, product, symbol, panel, label)
     for row, name in enumerate(channels, start=len(LAWS)):
-        unit = unit_label(product[name].attrs.get("units"))
-        label_panel(figure, f"y{row + 1}", plain_text(f"{name.replace('_', ' ')} {unit}"))
-        figure.add_scatter(
-            x=milliseconds(product),
-            y=single(product[name].values),
-            yaxis=f"y{row + 1}",
-            name=plain_text(name.replace("_", " ")),
-            line={"color": "#404040", "width": 1.5},
-            showlegend=False,
-        )
+        add_channel(figure, row, name, milliseconds(product), product[name], colour="#404040")
     return figure
 
 
@@ -219,7 +212,7 @@ def _add_coefficient(
     figure: go.Figure, product: xr.Dataset, symbol: str, panel: str, label: str
 ) -> None:
     """Add estimates as points with standard errors, and upper limits as open arrows."""
-    state = product["observable"].sel(term=symbol).values
+    values, limits = split_coefficient(product, symbol)
     shown = find_shown_values(product, symbol)
     is_wide = shown.size > 0 and shown.max() > 10 * shown.min()  # than a decade
     scale = log_axis("", shown, labels=5) if is_wide else {"rangemode": "tozero"}
@@ -227,23 +220,19 @@ def _add_coefficient(
     for row, name in enumerate(axis_names(product)):
         colour = axis_style(product, name)["color"]
         shared = {"x": milliseconds(product), "yaxis": panel, "legendgroup": name}
-        limits = np.where(
-            state[row] == UPPER_LIMIT_ONLY, product[f"{symbol}_upper"].values[row], np.nan
-        )
-        if np.isfinite(limits).any():
+        if np.isfinite(limits[row]).any():
             figure.add_scatter(
                 **shared,
-                y=single(limits),
+                y=single(limits[row]),
                 mode="markers",
                 name=f"axis {plain_text(name)}, upper limit",
                 marker={"color": colour, "symbol": "arrow-bar-down-open", "size": 8},
                 hovertemplate=f"< %{{y:.3g}} {label}",
                 showlegend=False,
             )
-        values = np.where(state[row] == OBSERVED, product[symbol].values[row], np.nan)
         figure.add_scatter(
             **shared,
-            y=single(values),
+            y=single(values[row]),
             error_y={
                 "array": single(product[f"{symbol}_stderr"].values[row]),
                 "color": colour,
@@ -311,7 +300,7 @@ def _draw_surface(product: xr.Dataset) -> go.Figure:
     values = _log_deviation(product)
     # from the first window, because WebGL computes with 32 bits
     seconds = (milliseconds(product) - milliseconds(product)[0]) / 1e3
-    size, unit = unit_of_time(float(seconds[-1]))
+    size, unit = largest_unit(float(seconds[-1]) / 3)
     figure = new_chart(
         scene={
             "xaxis": {"title": {"text": f"time [{unit}]"}},

@@ -21,6 +21,7 @@ from gyrostab.schema.checks import name_axes as name_axes
 from gyrostab.schema.checks import refuse_multi_index as refuse_multi_index
 from gyrostab.schema.checks import require_dataset as require_dataset
 from gyrostab.schema.checks import signal_name as signal_name
+from gyrostab.schema.checks import split_coefficient as split_coefficient
 from gyrostab.schema.checks import texts as texts
 from gyrostab.schema.checks import with_axis as with_axis
 from gyrostab.schema.variables import ESTIMATORS as ESTIMATORS
@@ -34,3 +35,4 @@ from gyrostab.schema.variables import SIGNAL_UNITS as SIGNAL_UNITS
 from gyrostab.schema.variables import UPPER_LIMIT_ONLY as UPPER_LIMIT_ONLY
 from gyrostab.schema.variables import VARIABLES as VARIABLES
 from gyrostab.schema.variables import attributes as attributes
+from gyrostab.schema.variables import flag_attributes as flag_attributes

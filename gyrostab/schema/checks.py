@@ -9,9 +9,16 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from gyrostab.arrays import Floats
 from gyrostab.errors import SchemaError
 from gyrostab.noise import TERMS
-from gyrostab.schema.variables import RESERVED_NAMES, SIGNAL_UNITS, VARIABLES
+from gyrostab.schema.variables import (
+    OBSERVED,
+    RESERVED_NAMES,
+    SIGNAL_UNITS,
+    UPPER_LIMIT_ONLY,
+    VARIABLES,
+)
 
 #: What tau may differ from a whole number of samples, as a share: the rounding of stored numbers,
 #: far below a sample in any window.
@@ -131,6 +138,16 @@ def find_unusable_channels(log: xr.Dataset) -> dict[str, str]:
 def is_rate_of_change(name: str, product: xr.Dataset) -> bool:
     """Whether a channel of a product is the rate of change of another of its channels."""
     return name.endswith("_rate") and name.removesuffix("_rate") in product.data_vars
+
+
+def split_coefficient(product: xr.Dataset, term: str) -> tuple[Floats, Floats]:
+    """Return the values of a term where it is observed, and the upper limits where it has only one.
+
+    Both are NaN elsewhere.
+    """
+    state = product["observable"].sel(term=term).values
+    values = np.where(state == OBSERVED, product[term].values, np.nan)
+    return values, np.where(state == UPPER_LIMIT_ONLY, product[f"{term}_upper"].values, np.nan)
 
 
 def require_dataset(dataset: Any, kind: str) -> None:

@@ -38,7 +38,8 @@ SIGNAL_UNITS = {"rate": INNER["rate"], "angle": INNER["angle"]}
 SIGNAL_LONG_NAMES = {"rate": "rotation rate", "angle": "angle"}
 
 
-def _flag_attributes(meanings: tuple[str, ...]) -> dict[str, Any]:
+def flag_attributes(meanings: tuple[str, ...]) -> dict[str, Any]:
+    """Return the attributes of flags that have these meanings, in the order of their numbers."""
     return {
         "flag_values": np.arange(len(meanings), dtype=np.int8),
         "flag_meanings": " ".join(meanings),
@@ -67,7 +68,7 @@ VARIABLES: dict[str, dict[str, Any]] = {
     "count": _make_attrs("second differences used"),
     "coverage": _make_attrs("second differences used, share of the gap-free number"),
     "edf": _make_attrs("equivalent degrees of freedom of the Allan variance"),
-    "estimator": {"long_name": "estimator of the Allan variance", **_flag_attributes(ESTIMATORS)},
+    "estimator": {"long_name": "estimator of the Allan variance", **flag_attributes(ESTIMATORS)},
     "gap_factor": _make_attrs("degrees of freedom left by the gaps, share of the gap-free ones"),
     "white_response": _make_attrs(
         "Allan variance of angle random walk seen through the gaps, as a share of the gap-free law"
@@ -105,7 +106,7 @@ VARIABLES: dict[str, dict[str, Any]] = {
     "window_coverage": _make_attrs("share of the window's samples that are present"),
     "observable": {
         "long_name": "whether the window shows the noise term",
-        **_flag_attributes(OBSERVABLE),
+        **flag_attributes(OBSERVABLE),
     },
     "fit_chi2": _make_attrs("misfit of the five-term model, generalised least squares chi-square"),
     "fit_dof": _make_attrs("degrees of freedom of the misfit"),

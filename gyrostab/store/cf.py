@@ -32,8 +32,7 @@ from gyrostab.store.private import close_function, is_in_memory
 from gyrostab.store.safe_names import make_names_storable, restore_names
 from gyrostab.store.times import (
     decode_stamps,
-    encode_all_stamps,
-    encode_first_stamp,
+    encode_grid,
     encode_stamps,
     find_time_grids,
     has_whole_microseconds,
@@ -87,10 +86,8 @@ def to_disk(
         variable = _convert_type(name, variable)
         known_attrs = {key: item for key, item in variable.attrs.items() if key not in DECODING}
         if name in grids:
-            encode = encode_all_stamps if stamps else encode_first_stamp
-            variables[name if stamps else f"{name}_start"] = encode(
-                grids[name], known_attrs, divisor
-            )
+            encoded = encode_grid(grids[name], known_attrs, divisor, stamps=stamps)
+            variables[name if stamps else f"{name}_start"] = encoded
             continue
         is_index = name in dataset.dims
         stored = variable if is_index else transpose_lazy(_make_lazy(variable), _DISK_ORDER)

@@ -18,7 +18,6 @@ section III.E (global heap).
 
 from __future__ import annotations
 
-import json
 import os
 import struct
 from collections.abc import Collection, Iterator, Mapping
@@ -27,7 +26,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from gyrostab.errors import FormatError
-from gyrostab.store.output.content import METADATA, UNFINISHED
+from gyrostab.store.output.content import METADATA, UNFINISHED, read_json
 
 #: Codecs of Zarr format 2 that only restore numbers or text; format 3 has no others.
 _HARMLESS_CODECS = {
@@ -121,7 +120,7 @@ def _find_blosc_arrays(folder: Path) -> Iterator[Path]:
     consolidated = _read_consolidated(folder)
     for place, _, names in os.walk(folder):
         metadata = [consolidated.get(Path(place).relative_to(folder).as_posix())]
-        metadata += [_read_json(Path(place, name)) for name in {".zarray", "zarr.json"} & {*names}]
+        metadata += [read_json(Path(place, name)) for name in {".zarray", "zarr.json"} & {*names}]
         if any(map(_uses_blosc, metadata)):
             yield Path(place)
 
@@ -130,19 +129,11 @@ def _read_consolidated(folder: Path) -> dict[str, Any]:
     """Return the consolidated metadata of the arrays in a store of format 2 or 3."""
     try:
         if (folder / ".zmetadata").exists():
-            entries = _read_json(folder / ".zmetadata")["metadata"]
+            entries = read_json(folder / ".zmetadata")["metadata"]
             return {name.removesuffix("/.zarray"): entry for name, entry in entries.items()}
-        return dict(_read_json(folder / "zarr.json")["consolidated_metadata"]["metadata"])
+        return dict(read_json(folder / "zarr.json")["consolidated_metadata"]["metadata"])
     except (LookupError, TypeError, ValueError, AttributeError):
         return {}
-
-
-def _read_json(path: Path) -> Any:
-    """Read JSON in any encoding that the library reads; None if it refuses it."""
-    try:
-        return json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return None
 
 
 def _uses_blosc(metadata: Any) -> bool:

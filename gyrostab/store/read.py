@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.arrays import Array
+from gyrostab.arrays import Array, Ints
 from gyrostab.errors import DamageError, FormatError, reading_of
 from gyrostab.kernels.encoding.counts import from_counts
 from gyrostab.store.damage import check_blosc_chunks, check_codecs, check_global_heaps
@@ -28,7 +28,6 @@ from gyrostab.store.lazy import FileVariable, RowSource, make_dask
 from gyrostab.store.private import close_function
 from gyrostab.store.remote import ROOT_METADATA, find_kind, find_url, reaching
 from gyrostab.store.times import decode_stamps, index_dim, parse_time_grids, replace_stamps
-from gyrostab.time.grid import GridTransform
 from gyrostab.wording import list_some
 
 #: Values from which a variable is a dask array.
@@ -216,20 +215,18 @@ def _is_sampled(variable: xr.Variable) -> bool:
     return dim.startswith("time") and variable.dtype.kind == "f" and variable.size > 0
 
 
-def _find_chunk_spans(
-    stored: xr.Dataset, dim: str, length: int, path: Path
-) -> GridTransform | tuple[tuple[int, int], ...]:
-    """Find the grid of a computed time axis, or the first and last stamp [ns] of each chunk."""
+def _find_chunk_spans(stored: xr.Dataset, dim: str, length: int, path: Path) -> Ints:
+    """Find the first and last stamp [ns] of each chunk along a time axis; none without stamps."""
+    size = stored.sizes[dim]
+    first = np.arange(0, size, length)
+    ends = np.stack([first, np.minimum(first + length, size) - 1], axis=1)
     for grid in parse_time_grids(stored.variables, path).values():
         if dim in (grid.dims[0], index_dim(grid.dims[0])):
-            return grid
+            return grid.stamps_at(ends)
     if dim not in stored.variables:
-        return ()
+        return ends[:0]
     stamps = decode_stamps(stored.variables[dim]).values.view(np.int64)
-    return tuple(
-        (int(stamps[at]), int(stamps[min(at + length, stamps.size) - 1]))
-        for at in range(0, stamps.size, length)
-    )
+    return np.asarray(stamps[ends])
 
 
 @dataclass(eq=False, kw_only=True)
@@ -244,7 +241,7 @@ class _ChunkedVariable(RowSource):
     length: int
     scale: float | None
     missing: Any
-    spans: GridTransform | tuple[tuple[int, int], ...]
+    spans: Ints
     strict: bool
     opened: str
     zarr: bool
@@ -291,14 +288,8 @@ class _ChunkedVariable(RowSource):
 
     def _handle_damage(self, row: int, number: int, damage: str) -> None:
         """Warn of a damaged chunk, once, or raise `FormatError`."""
-        if isinstance(self.spans, GridTransform):
-            end = min((number + 1) * self.length, self.shape[-1])
-            span = self.spans.stamps_at([number * self.length, end - 1])
-        else:
-            span = np.array(self.spans[number] if self.spans else (), dtype=np.int64)
-        when = " to ".join(
-            str(stamp).rstrip("0").rstrip(".") for stamp in span.view("datetime64[ns]")
-        )
+        stamps = self.spans[number : number + 1].ravel().view("datetime64[ns]")
+        when = " to ".join(str(stamp).rstrip("0").rstrip(".") for stamp in stamps)
         problem = f"{self.path}: {self.rows[row]}: the chunk from {when} {damage}"
         if self.strict:
             raise FormatError(

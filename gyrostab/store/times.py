@@ -67,36 +67,28 @@ def find_time_grids(dataset: xr.Dataset) -> dict[Any, GridTransform]:
     return grids
 
 
-def encode_first_stamp(grid: GridTransform, attrs: dict[Any, Any], divisor: int) -> xr.Variable:
-    """Encode a computed time axis: its first stamp, with rate and exact rule as attributes."""
+def encode_grid(
+    grid: GridTransform, attrs: dict[Any, Any], divisor: int, *, stamps: bool
+) -> xr.Variable:
+    """Encode a computed time axis with its exact rule as an attribute.
+
+    With `stamps` it is a lazy CF coordinate, otherwise the first stamp alone.
+    """
     (dim,) = grid.dims
-    attributes = {
-        "long_name": f"time of the first sample on the dimension {index_dim(dim)}",
-        "comment": "sample n (from 0) is at this time + n / sampling_rate_hz; "
-        f"{GRID} is the exact rule: "
-        "start_ns + round((first + stride * n) * 1e9 / rate_hz) nanoseconds since 1970",
-        "sampling_rate_hz": grid.rate / grid.samples.step,
-    }
-    return xr.Variable(
-        (),
-        grid.stamps_at(0) // divisor,
-        {**attributes, **_encode_rule(grid, attrs), **time_attributes(divisor)},
-    )
-
-
-def encode_all_stamps(grid: GridTransform, attrs: dict[Any, Any], divisor: int) -> xr.Variable:
-    """Encode a computed time axis as a lazy CF coordinate, with its exact rule as an attribute."""
-    (dim,) = grid.dims
-    attributes = {"long_name": "time", "standard_name": "time"}
-    attributes |= {"axis": "T"} if dim == "time" else {}
-    stamps = make_dask(_GridStamps(grid, divisor), min(max(grid.size, 1), _STAMPS_CHUNK))
-    return xr.Variable(
-        (dim,), stamps, {**attributes, **_encode_rule(grid, attrs), **time_attributes(divisor)}
-    )
-
-
-def _encode_rule(grid: GridTransform, attrs: dict[Any, Any]) -> dict[str, str]:
-    (dim,) = grid.dims
+    attributes: dict[str, Any]
+    if stamps:
+        data = make_dask(_GridStamps(grid, divisor), min(max(grid.size, 1), _STAMPS_CHUNK))
+        attributes = {"long_name": "time", "standard_name": "time"}
+        attributes |= {"axis": "T"} if dim == "time" else {}
+    else:
+        data = grid.stamps_at(0) // divisor
+        attributes = {
+            "long_name": f"time of the first sample on the dimension {index_dim(dim)}",
+            "comment": "sample n (from 0) is at this time + n / sampling_rate_hz; "
+            f"{GRID} is the exact rule: "
+            "start_ns + round((first + stride * n) * 1e9 / rate_hz) nanoseconds since 1970",
+            "sampling_rate_hz": grid.rate / grid.samples.step,
+        }
     rule = {
         "dim": dim,
         "start_ns": grid.start,
@@ -105,10 +97,10 @@ def _encode_rule(grid: GridTransform, attrs: dict[Any, Any]) -> dict[str, str]:
         "stride": grid.samples.step,
         "size": grid.size,
     }
-    return {
-        GRID: json.dumps(rule),
-        **({"axis_attributes": json.dumps(dict(attrs), default=str)} if attrs else {}),
-    }
+    attributes[GRID] = json.dumps(rule)
+    if attrs:
+        attributes["axis_attributes"] = json.dumps(dict(attrs), default=str)
+    return xr.Variable(grid.dims[: data.ndim], data, {**attributes, **time_attributes(divisor)})
 
 
 class _GridStamps(RowSource):

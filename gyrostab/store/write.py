@@ -57,7 +57,8 @@ def chunk_samples(rate: float) -> int:
 def as_counts(name: str, variable: xr.Variable) -> xr.Variable:
     """Convert a variable to counts of 16 or 32 bits if its encoding declares them.
 
-    The encoding must hold an integer dtype and a scale factor; other variables stay unchanged.
+    The encoding must hold an integer dtype and a scale factor; other variables stay unchanged. That
+    of counts then holds the one for missing values.
 
     Raises
     ------
@@ -78,15 +79,9 @@ def as_counts(name: str, variable: xr.Variable) -> xr.Variable:
     dtype = "int16" if declared.itemsize == 1 or declared == np.int16 else "int32"
     pack = partial(_pack_counts, name=name, scale=float(scale), dtype=dtype)
     packed = convert_values(variable.data, pack, dtype)
-    return xr.Variable(
-        variable.dims,
-        packed,
-        {
-            **variable.attrs,
-            "scale_factor": float(scale),
-            "_FillValue": np.dtype(dtype).type(FILL_VALUES[dtype]),
-        },
-    )
+    attrs = {**variable.attrs, "scale_factor": float(scale)}
+    fill = np.dtype(dtype).type(FILL_VALUES[dtype])
+    return xr.Variable(variable.dims, packed, attrs, {"_FillValue": fill})
 
 
 def _pack_counts(
@@ -200,13 +195,9 @@ def append_netcdf(
     # not in the threads: a call of h5py there made the writing of chunks fail
     chunks = {name: plist.get_chunk() for name, plist in creation.items()}
     codecs = {name: find_hdf5_codecs(plist) for name, plist in creation.items()}
-    fills = {
-        name: variable.attrs.get("_FillValue", encoding[name].get("_FillValue"))
-        for name, variable in large.items()
-    }
 
     def compress(name: str, values: Array) -> Any:
-        fill = fills[name]
+        fill = encoding[name]["_FillValue"]
         native = values.dtype.newbyteorder("=")  # that of the variable in the file
         chunk = np.full(chunks[name], 0 if fill is None else fill, native)
         inside = chunk[tuple(map(slice, values.shape))]
@@ -239,10 +230,9 @@ def _create_variable(
         if dim not in file.dimensions:
             file.createDimension(str(dim), size)
     options = dict(encoding)
-    fill = variable.attrs.get("_FillValue", options.pop("_FillValue", None))
-    kind = variable.dtype.newbyteorder("=")
+    fill, kind = options.pop("_FillValue"), variable.dtype.newbyteorder("=")
     made = file.createVariable(name, kind, _dim_names(variable), fill_value=fill, **options)
-    made.setncatts({key: value for key, value in variable.attrs.items() if key != "_FillValue"})
+    made.setncatts(variable.attrs)
 
 
 def append_zarr(
@@ -259,17 +249,15 @@ def append_zarr(
     targets: dict[str, Any] = {}
     for name, variable in large.items():
         options = dict(encoding[name])
-        fill = variable.attrs.get("_FillValue", options.pop("_FillValue", None))
         attrs = {
             key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
             for key, value in variable.attrs.items()
-            if key != "_FillValue"
         }
         targets[name] = group.create_array(
             name,
             shape=variable.shape,
             dtype=variable.dtype,
-            fill_value=fill,
+            fill_value=options.pop("_FillValue"),
             attributes={"_ARRAY_DIMENSIONS": _dim_names(variable), **attrs},
             config={"write_empty_chunks": True},
             **options,

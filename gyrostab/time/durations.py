@@ -86,10 +86,21 @@ def format_duration(seconds: float, space: str = "") -> str:
     >>> format_duration(90.0), format_duration(0.25), format_duration(7200, " ")
     ('1.5min', '0.25s', '2 h')
     """
-    units = ((86400, "d"), (3600, "h"), (60, "min"))
-    size, name = next((unit for unit in units if seconds >= unit[0]), (1, "s"))
+    size, name = largest_unit(seconds)
     rounded = float(f"{seconds / size:.{3 if size == 1 else 4}g}")
     return f"{np.format_float_positional(rounded, trim='-')}{space}{name}"
+
+
+def largest_unit(seconds: float) -> tuple[float, str]:
+    """Find the largest unit that is at most as long as a length of time, in seconds, and its name.
+
+    Examples
+    --------
+    >>> largest_unit(7200.0), largest_unit(0.1)
+    ((3600.0, 'h'), (1.0, 's'))
+    """
+    units = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"))
+    return next((unit for unit in units if seconds >= unit[0]), (1.0, "s"))
 
 
 def samples(value: Any, rate: float, option: str) -> int:

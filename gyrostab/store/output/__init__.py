@@ -2,7 +2,7 @@
 
 from gyrostab.store.output.check import check_folder, check_output, check_target, resolve_link
 from gyrostab.store.output.content import find_foreign_item, read_json
-from gyrostab.store.output.inputs import describe_file, find_sources, follow_inputs, protect_inputs
+from gyrostab.store.output.inputs import describe_file, find_sources, protect_inputs
 from gyrostab.store.output.write import (
     hide_name,
     is_leftover,
@@ -20,7 +20,6 @@ __all__ = [
     "describe_file",
     "find_foreign_item",
     "find_sources",
-    "follow_inputs",
     "hide_name",
     "is_leftover",
     "new_folder",

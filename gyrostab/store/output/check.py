@@ -41,7 +41,6 @@ def check_output(
     *,
     suffixes: Sequence[str] = (),
     overwrite: bool = False,
-    inputs: Iterable[str | os.PathLike[str]] = (),
     find_foreign: FindForeign | None = None,
 ) -> Path:
     """Check, before the computation starts, that a result can be written and nothing else is lost.
@@ -55,9 +54,6 @@ def check_output(
         Allowed suffixes, with the dot; empty for any.
     overwrite : bool
         Whether an existing output may be replaced.
-    inputs : iterable of path-like
-        Files that a lazy dataset reads, in addition to those of
-        `gyrostab.store.output.protect_inputs`.
     find_foreign : callable, optional
         Function that finds an item that must not be removed; the output is a folder then. By
         default the output is a Zarr store if its name ends in ``.zarr``, else a file.
@@ -82,7 +78,7 @@ def check_output(
         )
     if find_foreign is None and path.suffix.lower() == ".zarr":
         find_foreign = find_foreign_item
-    target = check_target(path, overwrite=overwrite, inputs=inputs, find_foreign=find_foreign)
+    target = check_target(path, overwrite=overwrite, find_foreign=find_foreign)
     if not find_url(path):
         _check_writable(path, target.parent)
     return path
@@ -123,7 +119,11 @@ def check_target(
     inputs: Iterable[str | os.PathLike[str]] = (),
     find_foreign: FindForeign | None = None,
 ) -> Path:
-    """Do what `check_output` does, without a test write; return the target of the path."""
+    """Do what `check_output` does, without a test write; return the target of the path.
+
+    `inputs` are files that a lazy dataset reads, in addition to those of
+    `gyrostab.store.output.protect_inputs`.
+    """
     url = find_url(path)
     if url is not None:
         _check_address(url, store=find_foreign is not None)

@@ -23,10 +23,9 @@ UNFINISHED = re.compile(r"\.[0-9a-f]{32}\.partial$")
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file, local or at an address; None if it cannot be read."""
+    """Read a JSON file, local or at an address, in any encoding; None if it cannot be read."""
     try:
-        content = read_bytes(path)
-        return json.loads(content.decode(json.detect_encoding(content)))
+        return json.loads(read_bytes(path))
     except (OSError, ValueError, RecursionError):
         return None
 

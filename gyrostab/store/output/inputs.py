@@ -75,12 +75,12 @@ def match_files(paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 @contextlib.contextmanager
 def protect_inputs(
-    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], *, growing: bool = False
 ) -> Iterator[None]:
     """Refuse, in the ``with`` block, outputs that would replace an input or a folder around it.
 
     An output is also refused when an input has changed before the output is complete, except for
-    TOML files, which are read at the start.
+    TOML files, which are read at the start. With `growing`, all inputs may change.
 
     Examples
     --------
@@ -98,19 +98,10 @@ def protect_inputs(
     files: dict[Path, dict[str, Any] | None] = {}
     for path in match_files(paths):
         is_data = path.suffix.lower() != ".toml" and (path.is_file() or is_store(path))
-        files[path] = describe_file(path) if is_data and path not in protected else None
-    token = _PROTECTED.set({**files, **protected})
-    try:
-        yield
-    finally:
-        _PROTECTED.reset(token)
-
-
-@contextlib.contextmanager
-def follow_inputs(paths: Iterable[str | os.PathLike[str]]) -> Iterator[None]:
-    """Protect inputs as `protect_inputs` does, but let these and all others change: they grow."""
-    inputs = [*protected_inputs(), *match_files(paths)]
-    token = _PROTECTED.set(dict.fromkeys(inputs))
+        is_fixed = is_data and not growing and path not in protected
+        files[path] = describe_file(path) if is_fixed else None
+    files |= protected
+    token = _PROTECTED.set(dict.fromkeys(files) if growing else files)
     try:
         yield
     finally:

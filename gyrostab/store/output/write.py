@@ -47,7 +47,7 @@ def new_output(
     path : path-like
         The final name; a symbolic link means its target.
     overwrite, find_foreign, inputs
-        As for `gyrostab.store.output.check_output`.
+        As for `gyrostab.store.output.check_target`.
 
     Yields
     ------
