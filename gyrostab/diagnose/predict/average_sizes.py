@@ -290,7 +290,9 @@ def refine_grid(component: Component, state: State, points: Sequence[Point]) -> 
 
     The grid is extended where the likelihood still rises at its end. A step is halved about the
     best point, and again while its ends are likely and differ, so that the likelihood is smooth
-    from point to point. Points within a step share its weight.
+    from point to point. The grid has a line for each value of its other parameters. Steps about the
+    best point of every line are halved as long as the peak between the points may be likely. Points
+    within a step share its weight.
     """
     scale = _find_scale(component, points)
     if scale is None:
@@ -352,18 +354,16 @@ class _Grid:
 
     def halve_steps(self, most: int) -> bool:
         """Halve the steps that need it, the likeliest first; return whether there are any."""
-        best = self.find_best()
+        likely = self.find_best().evidence - LIKELY_NATS
         is_first = not any(point.place % 1.0 for point in self.points)
-        steps = [
-            (line, left, right)
-            for line in self.lines
-            for left, right in pairwise(line)
-            if (is_first and (best is left or best is right))
-            or (
-                max(left.evidence, right.evidence) > best.evidence - LIKELY_NATS
-                and _are_different(left, right)
-            )
-        ]
+        steps = []
+        for line in self.lines:
+            peak, highest = _find_peak(line)
+            for left, right in pairwise(line):
+                is_at_peak = peak is left or peak is right
+                top = highest if is_at_peak else max(left.evidence, right.evidence)
+                if top > likely and ((is_first and is_at_peak) or _are_different(left, right)):
+                    steps.append((line, left, right))
         steps.sort(key=lambda step: -max(point.evidence for point in step[1:]))
         added = []
         for line, left, right in steps[:most]:
@@ -413,6 +413,17 @@ class _Grid:
         line.append(added)
         line.sort(key=lambda point: point.place)
         return added
+
+
+def _find_peak(line: Sequence[Point]) -> tuple[Point, float]:
+    """Return the best point of a line, and an upper bound of the evidence between points.
+
+    A concave curve through three points at equal distances rises above the middle one by at most
+    the larger of the differences to the other two.
+    """
+    place = max(range(len(line)), key=lambda place: line[place].evidence)
+    lowest = min(point.evidence for point in line[max(place - 1, 0) : place + 2])
+    return line[place], 2.0 * line[place].evidence - lowest
 
 
 def _are_different(left: Point, right: Point) -> bool:

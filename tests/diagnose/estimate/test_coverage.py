@@ -92,9 +92,14 @@ def test_intervals_of_a_warm_up_faster_than_the_grid():
     assert median_half_width(estimates, "time") < 0.6 * time
 
 
-@pytest.mark.full
-def test_intervals_of_a_dead_band_between_grid_values():
-    width, size = 0.9, 0.15
+@pytest.mark.parametrize(
+    "size",
+    [pytest.param(0.15, marks=pytest.mark.full), 1.5],
+    ids=["weak", "strong"],
+)
+def test_intervals_of_a_dead_band_between_grid_values(size):
+    """At the widths of the grid, a wrong lag of the sensor fits best."""
+    width = 0.9
     heat = np.interp(np.arange(SECONDS), *np.transpose(HEAT))
     slider = np.empty_like(heat)
     last = heat[0]
