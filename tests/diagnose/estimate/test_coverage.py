@@ -94,7 +94,7 @@ def test_intervals_of_a_warm_up_faster_than_the_grid():
 
 @pytest.mark.parametrize(
     "size",
-    [pytest.param(0.15, marks=pytest.mark.full), pytest.param(1.5, marks=pytest.mark.slow)],
+    [pytest.param(0.15, marks=pytest.mark.full), 1.5],
     ids=["weak", "strong"],
 )
 def test_intervals_of_a_dead_band_between_grid_values(size):
