@@ -75,10 +75,15 @@ def _chain_sections(sections: Sequence[_Section]) -> tuple[Floats, Floats, Float
 
 
 def _factor_covariance(covariance: Floats) -> Floats:
-    """Factor a covariance, which may be singular, into a lower triangle."""
+    """Factor a covariance, which may be singular, into a lower triangle.
+
+    Its diagonal is not negative: the signs of a QR factor depend on the processor, and a process of
+    one seed with them.
+    """
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.ascontiguousarray(np.asarray(np.linalg.qr(root.T, mode="r")).T)
+    factor = np.asarray(np.linalg.qr(root.T, mode="r")).T
+    return np.ascontiguousarray(np.where(np.diagonal(factor) < 0.0, -factor, factor))
 
 
 def _integrate_moments(a: Floats, b: Floats, c: Floats, rate: float) -> tuple[Floats, Floats]:
