@@ -24,8 +24,8 @@ _running: list[subprocess.Popen[bytes]] = []
 def start_compilation(module: str, kernel: Any) -> None:
     """Run a module that compiles kernels in another process, unless the cache has `kernel`.
 
-    Nothing is started on a single processor core, where numba has no cache to write to, or while
-    such a process runs.
+    No process is started on a single processor core, where numba has no cache to write to, or while
+    another one runs.
 
     Parameters
     ----------

@@ -271,3 +271,12 @@ def test_sizes_of_several_axes_read_as_a_list():
         sensitivity=(0.3766, 0.371), low=700.0, high=800.0, axes=("x", "y")
     )
     assert "with a sensitivity of 0.3766 and 0.371 deg/h/g; each" in effect.say()
+
+
+@pytest.mark.parametrize("average", [False, True])
+def test_the_factors_of_a_process_are_unique(average):
+    """The signs of a matrix factor differ between processors, unless they are fixed."""
+    for reading in (band(700.0, 800.0, 400.0, average=average), oscillator(45.0, 20.0, 400.0)):
+        for factor in (reading.kick, reading.spread):
+            assert (np.triu(factor, 1) == 0.0).all()
+            assert (np.diagonal(factor) >= 0.0).all()

@@ -20,7 +20,7 @@ _TRANSITION_BLOCKS = (4, 8)  # lengths of the gradual changes that a jump is com
 EVENT_LENGTHS = 48  # that are tried, from two blocks up
 MIN_EVENT_LIMIT_BLOCKS = 8.0
 MIN_LEVEL_BLOCKS = 3  # before and after an event, that determine the level there
-_SHIFTS = 40  # of all restarts; limits time
+_SHIFTS = 40  # of all restarts: a share of 5 % is two of 41; limits time
 _VARIANCE_FACTORS = (10.0, 100.0, 1e3, 1e4, 1e5)  # relative to white and angle noise of a mean
 
 
