@@ -11,7 +11,16 @@ from typing import TypeVar
 import numpy as np
 
 from gyrostab.errors import GyrostabError
-from gyrostab.ingest.columns.dates import DAY_FIRST, NAMED_ZONE, NO_DATE, YEAR_FIRST, find_order
+from gyrostab.ingest.columns.dates import (
+    DAY_FIRST,
+    NAMED_ZONE,
+    NO_DATE,
+    YEAR_FIRST,
+    find_order,
+    holds_date,
+    is_time_of_day,
+    names_zone,
+)
 from gyrostab.ingest.columns.stamps import (
     NAT,
     cells_to_ns,
@@ -125,6 +134,21 @@ class FileColumn:
             stamps = cells_to_ns(cells, None, 0, order)
             steps = np.diff(stamps[stamps != NAT])
         return int((steps > 0).sum()) > RISES_OF_STAMPS * int((steps < 0).sum())
+
+
+def describe_cells(header: str, unit: str | None, cells: Sequence[str]) -> FileColumn:
+    """Describe a column by its first cells, which show whether it holds dates, and their order.
+
+    Examples
+    --------
+    >>> column = describe_cells("start", None, ["", "01.05.2026 08:00:00"])
+    >>> column.stamped, column.date_order
+    (True, 'DD/MM/YYYY')
+    """
+    filled = [cell for cell in cells if cell.strip()]
+    is_dated = any(holds_date(c) or is_time_of_day(c) or names_zone(c) for c in filled)
+    order = find_order(filled) if is_dated else YEAR_FIRST
+    return FileColumn(header, unit, stamped=is_dated, date_order=order, cells=cells)
 
 
 def split_header(text: str) -> tuple[str, str | None]:

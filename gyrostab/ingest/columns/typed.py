@@ -12,7 +12,13 @@ from gyrostab.arrays import Floats, Ints
 from gyrostab.ingest.columns.dates import is_iso
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
-from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, numbers_to_ns
+from gyrostab.ingest.columns.stamps import (
+    NANOSECOND,
+    NAT,
+    cells_to_ns,
+    integers_to_ns,
+    numbers_to_ns,
+)
 from gyrostab.ingest.options import FileSummary
 from gyrostab.store.threads import map_in_order
 from gyrostab.time.stamps import to_nanoseconds
@@ -56,6 +62,8 @@ def to_stamps(values: Any, column: Column) -> Ints:
     unit = column.time_unit
     if array.dtype.kind == "M":
         stamps = to_nanoseconds(array, far_as_nat=True)
+        if unit is None:
+            stamps = integers_to_ns(stamps, NANOSECOND, column.epoch)
     elif unit is None or array.dtype.kind not in "iuf":
         stamps = cells_to_ns(
             ["" if value is None else str(value) for value in array],

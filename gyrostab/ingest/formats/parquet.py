@@ -12,14 +12,12 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.dates import NO_DATE, YEAR_FIRST, find_order, holds_date
-from gyrostab.ingest.columns.headers import FileColumn, split_header
+from gyrostab.ingest.columns.headers import describe_cells, split_header
 from gyrostab.ingest.columns.plan import Plan
 from gyrostab.ingest.columns.plan_roles import plan_columns
 from gyrostab.ingest.columns.typed import (
     batch_rows,
     float32_note,
-    holds_dates,
     read_batches,
     summarise_columns,
 )
@@ -95,15 +93,21 @@ def _open_parquet(path: Path, options: ReadOptions) -> tuple[Any, Plan]:
         header, unit = entry.name, None if stored is None else stored.decode(errors="replace")
         if pa.types.is_duration(entry.type):
             header, unit = split_header(entry.name)[0], entry.type.unit
-        sample = () if head is None else _to_numpy(head.column(index))
-        texts = [value for value in sample if isinstance(value, str)]
-        is_dated = any(map(holds_date, texts))
-        order = find_order(texts) if is_dated else YEAR_FIRST
-        if pa.types.is_time(entry.type):
-            is_dated, order = True, NO_DATE
-        stamped = is_dated or holds_dates(sample)
-        columns.append(FileColumn(header, unit, stamped=stamped, date_order=order))
+        cells = [] if head is None else _read_cells(head.column(index))
+        columns.append(describe_cells(header, unit, cells))
     return file, plan_columns(path, columns, options)
+
+
+def _read_cells(column: Any) -> list[str]:
+    """Return the values of an arrow column as text; missing ones are empty, zoned stamps in UTC."""
+    import pyarrow as pa
+
+    values = _to_numpy(column)
+    if values.dtype.kind == "M":
+        is_zoned = pa.types.is_timestamp(column.type) and column.type.tz is not None
+        texts = np.datetime_as_string(values, timezone="UTC" if is_zoned else "naive")
+        return ["" if text == "NaT" else str(text) for text in texts]
+    return ["" if value is None else str(value) for value in values.tolist()]
 
 
 def _to_numpy(column: Any) -> Any:

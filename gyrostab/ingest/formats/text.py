@@ -11,7 +11,6 @@ import re
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import IO, cast
@@ -21,14 +20,8 @@ import xarray as xr
 
 from gyrostab.arrays import Ints
 from gyrostab.errors import FormatError, UnitError
-from gyrostab.ingest.columns.dates import (
-    find_order,
-    has_offset,
-    holds_date,
-    is_time_of_day,
-    names_zone,
-)
-from gyrostab.ingest.columns.headers import FileColumn
+from gyrostab.ingest.columns.dates import has_offset
+from gyrostab.ingest.columns.headers import describe_cells
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.plan_roles import plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
@@ -151,10 +144,7 @@ def _plan_file(path: Path, options: ReadOptions) -> tuple[Layout, Plan]:
         cells = [row[place] for row in layout.samples]
         cells = [n if is_number(n := layout.write_point(cell)) else cell for cell in cells]
         unit = layout.units.get(place) or _duration_unit(cells)
-        column = FileColumn(header, unit, cells=cells)
-        if any(holds_date(cell) or is_time_of_day(cell) or names_zone(cell) for cell in cells):
-            column = replace(column, stamped=True, date_order=find_order(cells))
-        columns.append(column)
+        columns.append(describe_cells(header, unit, cells))
     return layout, plan_columns(path, columns, options, above=layout.above)
 
 

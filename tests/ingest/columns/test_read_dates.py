@@ -223,16 +223,29 @@ ZONE_COLUMNS = [
 ]
 
 
-def write_zone(path: Path, column: str, cell: str) -> Path:
-    form = f"%Y-%m-%d %H:%M:%S.%f,{cell}"
-    return write(path, form, f"time,{column},gyro_x [deg/h]")
+def write_zone(folder: Path, form: str, column: str, cell: str, time: str = "time") -> Path:
+    """Write a log with a column beside the times, which Parquet stores as text or as a date."""
+    cells: Any = STAMPS.strftime("%Y-%m-%d %H:%M:%S.%f")
+    times = STAMPS if form == "parquet of dates" else cells
+    table = pd.DataFrame({time: times, column: cell, "gyro_x [deg/h]": np.arange(len(STAMPS)) % 7})
+    if form == "csv":
+        table.to_csv(folder / "log.csv", index=False)
+        return folder / "log.csv"
+    if cell.lstrip("+-").isdigit():
+        table[column] = int(cell)
+    table.to_parquet(folder / "log.parquet")
+    return folder / "log.parquet"
 
 
+FORMS = ["csv", "parquet of text", "parquet of dates"]
+
+
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(("column", "cell"), ZONE_COLUMNS)
 def test_zone_in_another_column_is_refused_until_the_user_says_what_the_times_are(
-    tmp_path: Path, column: str, cell: str
+    tmp_path: Path, form: str, column: str, cell: str
 ) -> None:
-    path = write_zone(tmp_path / "log.csv", column, cell)
+    path = write_zone(tmp_path, form, column, cell)
     with pytest.raises(UnitError, match=rf"{re.escape(repr(cell))}.*--unit time=UTC.*UTC-06:00"):
         read_log(path)
     local = read_log(path, unit={"time": "UTC+02:00"})
@@ -240,6 +253,7 @@ def test_zone_in_another_column_is_refused_until_the_user_says_what_the_times_ar
     np.testing.assert_array_equal(stamps_of(read_log(path, unit={"time": "UTC"})), STAMPS.values)
 
 
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(
     ("column", "cell"),
     [
@@ -252,9 +266,9 @@ def test_zone_in_another_column_is_refused_until_the_user_says_what_the_times_ar
     ],
 )
 def test_column_that_states_no_other_zone_than_utc_is_not_refused(
-    tmp_path: Path, column: str, cell: str
+    tmp_path: Path, form: str, column: str, cell: str
 ) -> None:
-    path = write_zone(tmp_path / "log.csv", column, cell)
+    path = write_zone(tmp_path, form, column, cell)
     np.testing.assert_array_equal(stamps_of(read_log(path)), STAMPS.values)
 
 
@@ -273,6 +287,23 @@ def test_zone_in_another_column_is_not_needed_for_times_that_have_one(
     form = f"%Y-%m-%dT%H:%M:%S.%f{offset},+02:00"
     path = write(tmp_path / "log.csv", form, f"{header},tz,gyro_x [deg/h]")
     expected = STAMPS + pd.Timedelta(hours=hours)
+    np.testing.assert_array_equal(stamps_of(read_log(path)), expected.values)
+
+
+@pytest.mark.parametrize("zone", ["UTC", "Europe/Oslo"])
+def test_zone_in_another_column_is_not_needed_for_dates_of_parquet_that_have_one(
+    tmp_path: Path, zone: str
+) -> None:
+    table = pd.DataFrame({"time": STAMPS.tz_localize("UTC").tz_convert(zone), "tz": "CEST"})
+    table["gyro_x [deg/h]"] = np.arange(len(STAMPS))
+    table.to_parquet(tmp_path / "log.parquet")
+    np.testing.assert_array_equal(stamps_of(read_log(tmp_path / "log.parquet")), STAMPS.values)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_offset_in_the_header_holds_for_every_format(tmp_path: Path, form: str) -> None:
+    path = write_zone(tmp_path, form, "tz", "CEST", time="Date Time, GMT-06:00")
+    expected = STAMPS + pd.Timedelta(hours=6)
     np.testing.assert_array_equal(stamps_of(read_log(path)), expected.values)
 
 
