@@ -35,7 +35,7 @@ from page import machine, make_parser, renew, table
 from gyrostab import davar, make_log
 from gyrostab.allan.plan import last_sample, make_plan, units_of_work
 from gyrostab.kernels.allan.integrate import present_runs
-from gyrostab.kernels.allan.surface import Unit, surface_unit
+from gyrostab.kernels.allan.surface import WorkUnit, surface_unit
 from gyrostab.kernels.workspace import Workspace
 from tests.support.published import published_sums
 
@@ -91,7 +91,7 @@ def bare(terms: float) -> Callable[[], object]:
     return lambda: numba_loop(theta, 1000, 100, round(terms / 1000))
 
 
-def number_of_terms(parts: list[np.ndarray], unit: Unit) -> float:
+def number_of_terms(parts: list[np.ndarray], unit: WorkUnit) -> float:
     """Second differences that the kernel forms: those within unbroken runs."""
     total = 0.0
     for part in parts:
@@ -120,7 +120,7 @@ def rooflines() -> dict[str, float]:
     return {name: n * turns / took / 1e9 for name, took in in_turns(loops, 9).items()}
 
 
-def pieces(x: np.ndarray, unit: Unit) -> list[np.ndarray]:
+def pieces(x: np.ndarray, unit: WorkUnit) -> list[np.ndarray]:
     return [
         row[part.start * unit.step : last_sample(part, unit)]
         for row in np.atleast_2d(x)
@@ -269,7 +269,7 @@ def archive(repeats: int, quick: bool) -> Iterator[str]:
     yield table(head, rows)
 
 
-def run_kernel(parts: list[np.ndarray], unit: Unit, workers: int) -> None:
+def run_kernel(parts: list[np.ndarray], unit: WorkUnit, workers: int) -> None:
     if workers == 1:
         space = Workspace()
         for part in parts:

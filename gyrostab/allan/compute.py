@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gyrostab.allan.freedoms import NoiseTables, estimate_freedoms, make_noise_tables
-from gyrostab.allan.plan import Plan, last_sample, units_of_work
+from gyrostab.allan.plan import SurfacePlan, last_sample, units_of_work
 from gyrostab.arrays import Array, Floats
 from gyrostab.kernels.allan.biased_samples import count_outliers, gap_edge_ratio
-from gyrostab.kernels.allan.surface import Cells, Unit, convert_to_native, surface_unit
+from gyrostab.kernels.allan.surface import Cells, WorkUnit, convert_to_native, surface_unit
 from gyrostab.kernels.workspace import Workspace, Workspaces
 from gyrostab.store.lazy import find_source, keep_sources, read_into, read_slice
 from gyrostab.units import HOUR
@@ -72,7 +72,10 @@ def _read_spans(
 
 
 def _compute_unit(
-    x: NDArray[np.generic], unit: Unit, tables: NoiseTables, space: Workspace | None = None
+    x: NDArray[np.generic],
+    unit: WorkUnit,
+    tables: NoiseTables,
+    space: Workspace | None = None,
 ) -> tuple[list[Floats], Floats]:
     """Compute one unit: the fields of the cells, see `Cells`, and plane fields (9, n_windows)."""
     cells, lines = surface_unit(x, unit, space)
@@ -94,20 +97,22 @@ def _compute_unit(
 
 
 def _compute_in_thread(
-    x: NDArray[np.generic], unit: Unit, tables: NoiseTables, spaces: Workspaces
+    x: NDArray[np.generic], unit: WorkUnit, tables: NoiseTables, spaces: Workspaces
 ) -> tuple[list[Floats], Floats]:
     """`_compute_unit` with the working memory of the calling thread."""
     return _compute_unit(x, unit, tables, spaces.own)
 
 
-def _stack_unit(x: NDArray[np.generic], unit: Unit, tables: NoiseTables) -> tuple[Floats, Floats]:
+def _stack_unit(
+    x: NDArray[np.generic], unit: WorkUnit, tables: NoiseTables
+) -> tuple[Floats, Floats]:
     """`_compute_unit` with all fields in one array (10, n_windows, n_tau)."""
     fields, means = _compute_unit(x, unit, tables)
     return np.stack(np.broadcast_arrays(*fields)), means
 
 
 def compute_windows(
-    plan: Plan, groups: Sequence[slice], space: Workspace
+    plan: SurfacePlan, groups: Sequence[slice], space: Workspace
 ) -> tuple[list[Array], Floats]:
     """Compute groups of windows, as `run_units` does, immediately and in the calling thread."""
     unit, tables = plan.unit, make_noise_tables(plan)
@@ -117,7 +122,7 @@ def compute_windows(
 
 
 def _join_units(
-    results: Sequence[tuple[list[Floats], Floats]], plan: Plan
+    results: Sequence[tuple[list[Floats], Floats]], plan: SurfacePlan
 ) -> tuple[list[Array], Floats]:
     """Join units, axis by axis: fields (axis, time, tau), plane fields (9, axis, time).
 
@@ -143,7 +148,7 @@ def _join_field(parts: list[Floats], sizes: list[int], n_axes: int, kind: Any) -
     return parts[0].reshape(shape)
 
 
-def run_units(plan: Plan) -> tuple[Any, Any]:
+def run_units(plan: SurfacePlan) -> tuple[Any, Any]:
     """Run the units of work: fields (axis, time, tau), plane fields (9, axis, time).
 
     The results are dask arrays if the signal is one.

@@ -19,7 +19,7 @@ from gyrostab.allan.compute import (
     compute_windows,
     run_units,
 )
-from gyrostab.allan.plan import MOST_CELLS, Plan, make_plan, units_of_work
+from gyrostab.allan.plan import MOST_CELLS, SurfacePlan, make_plan, units_of_work
 from gyrostab.errors import OptionError
 from gyrostab.ingest.convert import as_log
 from gyrostab.kernels.allan.variances import VARIANCES
@@ -249,7 +249,7 @@ def _attach_labels(
     cells: Any,
     means: Any,
     log: xr.Dataset,
-    plan: Plan,
+    plan: SurfacePlan,
     *,
     part: slice | None = None,
     numbers: Sequence[int] | None = None,

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.allan.band_limit import BandLimit, choose_windows, filter_response, find_band_limit
-from gyrostab.allan.fit_inputs import FIT_VARIABLES, check_options, prepare_fit, term_bits
+from gyrostab.allan.fit_inputs import FIT_VARIABLES, prepare_fit, resolve_fit_options, term_bits
 from gyrostab.allan.window_fit import fit_block
 from gyrostab.arrays import Floats, Ints
 from gyrostab.kernels.fit.covariance import STOCHASTIC
@@ -152,8 +152,8 @@ def fit_part(surface: xr.Dataset, **options: Any) -> xr.Dataset:
     surface : xarray.Dataset
         Surface of `gyrostab.allan.davar.davar_part`.
     **options
-        Options of `fit_noise`, and ``bands`` as from `find_bands`; without it, the filter is sought
-        in this part.
+        Options of `fit_noise`, and ``bands`` as from `find_band_limits`; without it, the filter is
+        sought in this part.
 
     Returns
     -------
@@ -183,9 +183,9 @@ def _fit_checked(
     bands: Bands | None = None,
 ) -> xr.Dataset:
     surface = with_axis(surface)
-    fitted_terms, chosen = check_options(surface, terms, tau_min, tau_max)
+    fitted_terms, chosen = resolve_fit_options(surface, terms, tau_min, tau_max)
     if bands is None:
-        bands = find_bands(surface, terms=fitted_terms, tau_min=tau_min, tau_max=tau_max)
+        bands = find_band_limits(surface, terms=fitted_terms, tau_min=tau_min, tau_max=tau_max)
     limits = [BandLimit(*bands[str(axis)]) for axis in surface["axis"].values]
     product = _fit_windows(
         surface,
@@ -210,7 +210,7 @@ def _fit_checked(
 _BAND_VARIABLES = ("fit_tau_min", "filter_time_constant", "filter_white_error")
 
 
-def find_bands(
+def find_band_limits(
     surface: xr.Dataset,
     *,
     terms: str | Iterable[str] = "QNBKR",
@@ -239,10 +239,10 @@ def find_bands(
     >>> from gyrostab.ingest.make_log import make_log
     >>> noise = np.random.default_rng(1).standard_normal(60_000)
     >>> smooth = np.convolve(noise, np.ones(9) / 9, mode="valid")  # time constant 80 / 27 samples
-    >>> find_bands(davar(make_log(smooth, rate=100.0, unit="deg/h"), window="1min"))
+    >>> find_band_limits(davar(make_log(smooth, rate=100.0, unit="deg/h"), window="1min"))
     {'x': BandLimit(tau_min=0.13, time_constant=0.0292, white_error=0.0122)}
     """
-    fitted_terms, chosen = check_options(surface, terms, tau_min, tau_max)
+    fitted_terms, chosen = resolve_fit_options(surface, terms, tau_min, tau_max)
     tau, axes = surface["tau"].values, list(map(str, surface["axis"].values))
     allan = surface.attrs.get("variance", "avar") == "avar"
     if tau_min is not None or not allan:

@@ -69,7 +69,7 @@ def check_fit_options(
     return fitted_terms, low, high
 
 
-def check_options(
+def resolve_fit_options(
     surface: xr.Dataset, terms: str | Iterable[str], tau_min: Any, tau_max: Any
 ) -> tuple[list[str], Ints]:
     """Check the options of a fit; return the terms, and the positions of the averaging times."""

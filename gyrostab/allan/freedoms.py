@@ -21,7 +21,7 @@ from gyrostab.kernels.fit.mixture import Curves
 from gyrostab.noise import sample_squares
 
 if TYPE_CHECKING:
-    from gyrostab.allan.plan import Plan
+    from gyrostab.allan.plan import SurfacePlan
 
 #: Largest number of averaging times in a fit; more add no information and cost the cube of their
 #: number.
@@ -46,7 +46,7 @@ class NoiseTables(NamedTuple):
     diagonal: Floats
 
 
-def make_noise_tables(plan: Plan) -> NoiseTables:
+def make_noise_tables(plan: SurfacePlan) -> NoiseTables:
     """Make the tables for the degrees of freedom of a plan."""
     unit = plan.unit
     return tabulate_noise(unit.window, tuple(unit.ks.tolist()), plan.rate, unit.variance)

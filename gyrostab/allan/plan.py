@@ -11,7 +11,7 @@ import xarray as xr
 
 from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import OptionError
-from gyrostab.kernels.allan.surface import Unit
+from gyrostab.kernels.allan.surface import WorkUnit
 from gyrostab.kernels.allan.variances import VARIANCES
 from gyrostab.schema import signal_name
 from gyrostab.time.durations import averaging_factors, samples
@@ -26,11 +26,11 @@ WINDOWS_S = (600, 300, 120, 60, 30, 20, 10, 5, 2, 1)
 MIN_WINDOW_SAMPLES = 4
 
 
-class Plan(NamedTuple):
+class SurfacePlan(NamedTuple):
     """Options of `davar`, in samples."""
 
     signal: xr.DataArray
-    unit: Unit
+    unit: WorkUnit
     rate: float
     attrs: dict[str, Any]
     #: Averaging factors of `unit` that were asked for; the noise is identified from all of them.
@@ -46,7 +46,7 @@ def make_plan(
     log: xr.Dataset, *, window: Any = None, step: Any = None, taus: Any = 40, tau_max: Any = None,
     axis: str | Sequence[str] | None = None, min_strict: float = 0.3, min_coverage: float = 0.1,
     variance: str = "avar",
-) -> Plan:  # fmt: skip
+) -> SurfacePlan:  # fmt: skip
     """Check the options of `davar` against a log of `gyrostab.ingest.convert.as_log`."""
     if not isinstance(variance, str) or variance not in VARIANCES:
         raise OptionError(f"variance={variance!r}: give one of {', '.join(VARIANCES)}")
@@ -67,7 +67,7 @@ def make_plan(
     order = VARIANCES[variance].order
     asked = averaging_factors(taus, rate=rate, window=length, tau_max=tau_max, order=order)
     ks, interval = _fill_octaves(asked), 1.0 / rate
-    unit = Unit(length, hop, ks, name == "angle", interval, min_strict, min_coverage, variance)
+    unit = WorkUnit(length, hop, ks, name == "angle", interval, min_strict, min_coverage, variance)
     attrs = {
         "window_s": length / rate, "step_s": hop / rate,
         "window_samples": length, "step_samples": hop,
@@ -76,7 +76,7 @@ def make_plan(
     }  # fmt: skip
     # a slice copies nothing
     reported = slice(None) if np.array_equal(ks, asked) else np.searchsorted(ks, asked)
-    return Plan(signal, unit, rate, attrs, reported)
+    return SurfacePlan(signal, unit, rate, attrs, reported)
 
 
 def _fill_octaves(ks: Ints) -> Ints:
@@ -163,7 +163,7 @@ def _window_and_step(window: Any, step: Any, rate: float, available: int) -> tup
     return length, hop
 
 
-def units_of_work(n_samples: int, unit: Unit) -> list[slice]:
+def units_of_work(n_samples: int, unit: WorkUnit) -> list[slice]:
     """Divide the windows into units of work, independently of any chunking."""
     points = unit.window + (1 if unit.angle else 0)
     n_windows = (n_samples - points) // unit.step + 1
@@ -176,6 +176,6 @@ def units_of_work(n_samples: int, unit: Unit) -> list[slice]:
     ]
 
 
-def last_sample(windows: slice, unit: Unit) -> int:
+def last_sample(windows: slice, unit: WorkUnit) -> int:
     """Find one past the last sample of some windows."""
     return int((windows.stop - 1) * unit.step + unit.window + (1 if unit.angle else 0))

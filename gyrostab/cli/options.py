@@ -158,7 +158,7 @@ class ChannelFile:
 
 @Parameter(name="*", group=_WINDOWS)
 @dataclass(frozen=True)
-class Windows:
+class Windowing:
     """The sliding window of the dynamic Allan variance.
 
     Parameters

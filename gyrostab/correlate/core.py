@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Floats, Ints
-from gyrostab.correlate.dataset import assemble, check_names
+from gyrostab.correlate.dataset import check_names, make_coupling_dataset
 from gyrostab.correlate.drivers import Driver, align_drivers, other_channels
 from gyrostab.correlate.fit import (
     SIGNIFICANCE,
@@ -163,7 +163,7 @@ def correlate(
         series_name = f"{names[v].replace('_', ' ')} of axis {product['axis'].values[a]}"
         entry["statement"] = describe_coupling(entry, drivers[d].label, series_name)
     longest = float(lags[counts.max() - 1] * step)
-    return assemble(product, names, drivers, entries, level=level, longest=longest)
+    return make_coupling_dataset(product, names, drivers, entries, level=level, longest=longest)
 
 
 def _check_windows(product: xr.Dataset) -> None:

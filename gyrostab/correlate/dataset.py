@@ -67,7 +67,7 @@ def check_names(drivers: list[Driver]) -> None:
         )
 
 
-def assemble(
+def make_coupling_dataset(
     product: xr.Dataset,
     names: list[str],
     drivers: list[Driver],

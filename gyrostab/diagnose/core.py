@@ -43,7 +43,7 @@ from gyrostab.diagnose.task import (
     NamedBlocks,
     Task,
     check_axis_names,
-    check_options,
+    check_diagnosis_options,
     lines_without_motion,
     read_simulation,
     take_lines_at_rest,
@@ -123,7 +123,7 @@ def diagnose(
     """
     from threadpoolctl import threadpool_limits
 
-    check_options(nulls, false_alarm_level, seed)
+    check_diagnosis_options(nulls, false_alarm_level, seed)
     log = as_log(log)
     check_axis_names(log)
     task = Task(

@@ -39,7 +39,7 @@ CALLER_LEVEL = 6
 MAX_ROUNDING_POWER = 1e-20
 
 
-def check_options(nulls: int, level: float, seed: int) -> None:
+def check_diagnosis_options(nulls: int, level: float, seed: int) -> None:
     """Raise `OptionError` unless these options of `gyrostab.diagnose` make sense."""
     for name, value in (("nulls", nulls), ("seed", seed)):
         if not isinstance(value, int | np.integer):

@@ -117,7 +117,7 @@ def _read_frame(
     from gyrostab.ingest.columns.plan_roles import plan_columns
     from gyrostab.ingest.columns.typed import read_columns
     from gyrostab.ingest.options import ReadOptions
-    from gyrostab.ingest.reading import check_options
+    from gyrostab.ingest.reading import refuse_unused_options
 
     table = (
         frame.to_frame("x" if frame.name is None else frame.name)
@@ -157,7 +157,7 @@ def _read_frame(
         columns = [FileColumn("time", stamped=True), *(FileColumn(header) for header in headers)]
         plan = plan_columns(Path("DataFrame"), columns, options)
         raw = read_columns(plan, len(table), fetch)
-        check_options([raw])
+        refuse_unused_options([raw])
     except MissingUnitError as error:
         problem, _, advice = str(error).partition("; give")
         stem, unit = ("angle", "deg") if "--unit angle=" in advice else ("gyro", "deg/s")

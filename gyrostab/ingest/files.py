@@ -16,7 +16,7 @@ from gyrostab.errors import FormatError, OptionError, reading_of
 from gyrostab.ingest.formats.binary import has_layout
 from gyrostab.ingest.formats.recognise import refuse_unread
 from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.store.remote import fetch_file, find_kind, find_url, list_urls
+from gyrostab.store.remote import fetch_file, find_remote_kind, find_url, list_urls
 
 GROUP = "gyrostab.readers"
 
@@ -158,7 +158,7 @@ def scan_file(path: str | Path, options: ReadOptions | None = None) -> FileSumma
 def _fetch_remote(path: Path) -> Path:
     """Return a temporary copy of a file at an address; other paths and Zarr stores as they are."""
     url = find_url(path)
-    return path if url is None or find_kind(url) == "store" else fetch_file(url)
+    return path if url is None or find_remote_kind(url) == "store" else fetch_file(url)
 
 
 def read_file(path: Path, options: ReadOptions) -> xr.Dataset:

@@ -11,6 +11,7 @@ import xarray as xr
 from gyrostab.arrays import Ints
 from gyrostab.errors import SchemaError
 from gyrostab.schema import GAP_CAUSES
+from gyrostab.time.durations import format_measured_duration
 from gyrostab.time.grid import grid_index, grid_times, time_coordinate
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 from gyrostab.units import HOUR
@@ -33,19 +34,6 @@ MISSING, UNREADABLE, DUPLICATE, OUTSIDE_RANGE, CLOCK_STEP, RESTART = map(
 )
 
 
-def format_duration(seconds: float) -> str:
-    """Format a duration with a suitable unit.
-
-    Examples
-    --------
-    >>> format_duration(1068.0), format_duration(0.0045), format_duration(200 * 3600)
-    ('1068.0 s', '4.5 ms', '200.0 h')
-    """
-    if abs(seconds) < 1.0:
-        return f"{seconds * 1e3:.3g} ms"
-    return f"{seconds:.1f} s" if abs(seconds) < 7200 else f"{seconds / HOUR:.1f} h"
-
-
 def is_restart(first: float, begin: float, before: float, after: float) -> bool:
     """Return whether a clock that steps back restarts, rather than being corrected.
 
@@ -64,7 +52,7 @@ def describe_break(place: str, cause: int, before: int, after: int, samples: str
     event = "time restarts" if cause == RESTART else "the clock steps"
     return (
         f"{event}{place}: from {format_stamp(before)} to {format_stamp(after)}, "
-        f"{format_duration(abs(jump))} {'back' if jump < 0 else 'ahead'}; "
+        f"{format_measured_duration(abs(jump))} {'back' if jump < 0 else 'ahead'}; "
         f"the pause is of unknown length, so the {samples} that follow come after one missing "
         f"sample{'' if jump < 0 else '; if the pause is real, raise max_gap'}"
     )

@@ -16,7 +16,7 @@ from gyrostab.errors import FormatError, GyrostabError
 from gyrostab.ingest.columns.dates import DAY_FIRST, EITHER_FIRST, MONTH_FIRST
 from gyrostab.ingest.columns.plan_time import UNREADABLE
 from gyrostab.ingest.files import read_file, scan_file
-from gyrostab.ingest.formats.text import read_head
+from gyrostab.ingest.formats.text import read_text_head
 from gyrostab.ingest.options import ColumnSummary, FileSummary, ReadOptions
 
 #: Largest number of columns to inspect; a sensor log has tens of them.
@@ -141,7 +141,7 @@ def inspect_file(path: str | Path, options: ReadOptions | None = None) -> FileIn
 
 def _has_half_days(path: Path) -> bool:
     """Return whether a text file begins with times such as ``10:00 PM``, of the United States."""
-    return bool(re.search(r":\d\d\s*[AaPp][Mm]\b", read_head(path)))
+    return bool(re.search(r":\d\d\s*[AaPp][Mm]\b", read_text_head(path)))
 
 
 def _span_s(path: Path, options: ReadOptions) -> float:

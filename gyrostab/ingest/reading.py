@@ -160,7 +160,7 @@ def read_log(
             limits=options.limits,
         )
     else:
-        check_options([*parts.values(), *channels])
+        refuse_unused_options([*parts.values(), *channels])
         log = concatenate(list(parts.values()))
         if lost and "time" not in log.variables:
             raise FormatError(
@@ -279,7 +279,7 @@ def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Datas
     return log.assign_attrs(notes=[*texts(log, "notes"), note])
 
 
-def check_options(parts: Sequence[xr.Dataset]) -> None:
+def refuse_unused_options(parts: Sequence[xr.Dataset]) -> None:
     """Refuse a ``--map`` or ``--unit`` that matches no file; it is probably mistyped."""
     unmatched = set.intersection(*(set(part.attrs.pop("unmatched_options", ())) for part in parts))
     headers = dict.fromkeys(name for part in parts for name in part.attrs.pop("headers", ()))

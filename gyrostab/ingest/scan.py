@@ -16,7 +16,7 @@ import xarray as xr
 from gyrostab.errors import GyrostabError
 from gyrostab.ingest.columns.plan_roles import scan_advice
 from gyrostab.ingest.files import expand, scan_file
-from gyrostab.ingest.formats.text import read_head
+from gyrostab.ingest.formats.text import read_text_head
 from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.ingest.grid.scan_pass import find_spans
@@ -222,7 +222,9 @@ def _try_guess(
     return best or InspectedFile([path], inspection, guess, options, None, failure)
 
 
-def add_channels(options: dict[str, Any], inspected: Sequence[InspectedFile]) -> dict[str, Any]:
+def add_channel_files(
+    options: dict[str, Any], inspected: Sequence[InspectedFile]
+) -> dict[str, Any]:
     """Return options that also read the channels of the files without a gyro."""
     files = [
         file
@@ -250,7 +252,7 @@ def _named_rate(path: Path) -> float | None:
     If it names several frequencies, only one of them may be in a phrase on a rate or on sampling.
     """
     rates: dict[float, bool] = {}  # whether a phrase says that this is a rate
-    for phrase in re.split(r"[\n,;]", read_head(path)):
+    for phrase in re.split(r"[\n,;]", read_text_head(path)):
         for match in _FREQUENCY.finditer(phrase):
             rate = float(match[1]) * (1000.0 if match[2] else 1.0)
             rates[rate] = rates.get(rate, False) or bool(_RATE_WORD.search(phrase))

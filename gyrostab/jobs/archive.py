@@ -26,7 +26,7 @@ from gyrostab.schema import escape_text
 from gyrostab.store.output import describe_file, read_json
 from gyrostab.store.output.content import METADATA, is_store
 from gyrostab.store.remote import (
-    find_kind,
+    find_remote_kind,
     find_url,
     full_name,
     list_urls,
@@ -103,7 +103,7 @@ def find_archive(paths: Sequence[str | Path]) -> Archive:
         for path in map(Path, matching):
             inside: Iterable[tuple[str, Path]] = ()
             if url:
-                is_file = find_kind(find_url(path) or url) == "file"
+                is_file = find_remote_kind(find_url(path) or url) == "file"
                 inside = [("file", path)] if is_file else _walk_folder(path, visited)
             elif not path.exists():
                 raise FormatError(f"{path}: there is no such file or folder")
@@ -127,7 +127,7 @@ def _find_base(item: str, *, is_pattern: bool, is_only_path: bool) -> Path:
         fixed = itertools.takewhile(lambda part: not glob.has_magic(part), path.parts)
         return Path(*fixed)
     url = find_url(item)
-    is_archive = find_kind(url) == "folder" if url else path.is_dir() and not is_store(path)
+    is_archive = find_remote_kind(url) == "folder" if url else path.is_dir() and not is_store(path)
     return path if is_only_path and is_archive else path.parent
 
 

@@ -112,7 +112,7 @@ def _read_verified_header(path: Path) -> bytes:
     return content[16 : 16 + int.from_bytes(content[8:16], "little")]
 
 
-def assemble(blocks: Sequence[Block]) -> xr.Dataset:
+def assemble_blocks(blocks: Sequence[Block]) -> xr.Dataset:
     """Assemble blocks in their order to one dataset.
 
     Its variables along time are dask arrays, in the chunks of the file that will be written.

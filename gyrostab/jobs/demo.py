@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.allan.summary import TermSummary, summarise_terms
 from gyrostab.errors import OutputError
-from gyrostab.jobs.load import count_samples, load_log
+from gyrostab.jobs.load import count_axis_samples, load_log
 from gyrostab.progress import Stage, no_stage
 
 WINDOW, STEP = "4h", "30min"
@@ -117,7 +117,7 @@ def run_demo(
             to_netcdf(log, temporary / "log.nc")
             stage("drawing the log")  # while another process compiles the fit, on the first run
             save_png(plot_signal(log), temporary / "signal.png", dpi=_DPI)
-            stage("computing", count_samples(log))
+            stage("computing", count_axis_samples(log))
             surface = davar(log, window=WINDOW, step=STEP).compute()
             stage("fitting")
             product = fit_noise(surface).compute()

@@ -15,7 +15,7 @@ import xarray as xr
 
 from gyrostab.allan.band_limit import choose_windows
 from gyrostab.allan.davar import davar_part, davar_sample
-from gyrostab.allan.fit import find_bands, fit_part
+from gyrostab.allan.fit import find_band_limits, fit_part
 from gyrostab.allan.plan import make_plan, units_of_work
 from gyrostab.jobs.checkpoint import Block, write_block
 from gyrostab.jobs.schedule import Pool, run_calls
@@ -53,7 +53,7 @@ def find_record_bands(
     count = units_of_work(log.sizes["time"], unit)[-1].stop
     numbers = choose_windows(count, unit.window, unit.step).tolist()
     surface = davar_sample(log, numbers=numbers, **windows).assign_attrs(step_samples=unit.window)
-    return {**fitting, "bands": find_bands(surface, **fitting)}
+    return {**fitting, "bands": find_band_limits(surface, **fitting)}
 
 
 def compute_blocks(

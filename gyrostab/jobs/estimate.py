@@ -15,7 +15,7 @@ from gyrostab.allan.davar import davar_parts
 from gyrostab.allan.plan import make_plan
 from gyrostab.io.datasets import to_netcdf
 from gyrostab.jobs.engine import compute_part
-from gyrostab.jobs.load import check_options, load_log
+from gyrostab.jobs.load import check_run_options, load_log
 from gyrostab.progress import watch_compiler
 
 
@@ -35,7 +35,7 @@ def estimate_run(
     The first part is computed on one core; the processor time and the size of the rest are taken to
     be in proportion to the number of windows. Cores that are busy with other programs need longer.
     """
-    check_options(reading=reading, windows=windows, fitting=fitting)
+    check_run_options(reading=reading, windows=windows, fitting=fitting)
     with _measure_work() as work_s:
         log = load_log(paths, **reading)
         plan, parts = make_plan(log, **windows), davar_parts(log, **windows)

@@ -45,13 +45,13 @@ from gyrostab.jobs.fleet_table import (
     make_table,
     open_archive,
     product_path,
-    read_rows,
+    read_fleet_rows,
     read_table,
     summarise_run,
     write_table,
 )
 from gyrostab.jobs.job import lock_output, make_fingerprint
-from gyrostab.jobs.load import check_options
+from gyrostab.jobs.load import check_run_options
 from gyrostab.jobs.run import find_job_name, read_job_name, run
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool, run_calls
 from gyrostab.progress import Stage, no_stage
@@ -180,7 +180,7 @@ def run_fleet(
         When the output or an option is wrong, or the output has results of other files or options.
     """
     scheduler = check_scheduler(scheduler)
-    options = check_options(reading=reading, windows=windows, fitting=fitting)
+    options = check_run_options(reading=reading, windows=windows, fitting=fitting)
     if url := find_url(output):
         check_address(url, ".zarr", is_own=is_fleet(Path(output)))
     else:
@@ -189,7 +189,7 @@ def run_fleet(
     with protect_inputs(paths), lock_output(target, overwrite=overwrite):
         archive, known_table = open_archive(paths, target)
         given_options = {**make_fingerprint([], options)["options"], "per": per}
-        if not overwrite and any(not row["error"] for row in read_rows(target).values()):
+        if not overwrite and any(not row["error"] for row in read_fleet_rows(target).values()):
             check_update(
                 output,
                 archive,
@@ -251,7 +251,7 @@ def _compute_runs(
     stage: Stage,
 ) -> pd.DataFrame:
     """Compute the runs that are new or changed, and write the table and the page of all runs."""
-    old_rows = read_rows(target)
+    old_rows = read_fleet_rows(target)
     with ThreadPoolExecutor(REQUESTS if find_url(target) else 1) as threads:
         is_current = threads.map(
             lambda item: (

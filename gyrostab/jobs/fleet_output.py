@@ -15,7 +15,7 @@ from gyrostab.jobs.archive import FLEET_MARK, FLEET_SCHEMA, Archive
 from gyrostab.jobs.fleet_table import is_zarr
 from gyrostab.jobs.job import describe_differences
 from gyrostab.store.output import read_json, write_text
-from gyrostab.store.remote import exists, find_kind, find_url, full_name
+from gyrostab.store.remote import exists, find_remote_kind, find_url, full_name
 
 REQUESTS = 16  # to an object store at a time
 _GROUP = {"zarr_format": 2}  # metadata of a Zarr group
@@ -26,7 +26,7 @@ def check_address(url: str, suffix: str, *, is_own: bool) -> None:
     """Check the address of an output: what another program wrote is never replaced."""
     if not url.lower().endswith(suffix):
         raise OptionError(f"output {url!r} must end in {suffix}; give another name with -o")
-    if not is_own and find_kind(url, required=False, error=OutputError):
+    if not is_own and find_remote_kind(url, required=False, error=OutputError):
         raise OutputError(
             f"output {url!r} exists already, and gyrostab fleet or index did not make it; remove "
             "it first, or give another name with -o"

@@ -100,7 +100,7 @@ def open_fleet(folder: Path) -> xr.Dataset | None:
     """
     folder = Path(full_name(folder))
     root = next((path for path in (folder, *folder.parents) if is_fleet(path)), None)
-    rows = {} if root is None else read_rows(root)
+    rows = {} if root is None else read_fleet_rows(root)
     paths = [product_path(root, name) for name, row in rows.items() if root and not row["error"]]
     products = []
     for path in paths:
@@ -180,7 +180,7 @@ def _find_worst_window(product: xr.Dataset) -> dict[str, Any]:
     }
 
 
-def read_rows(target: Path) -> dict[str, dict[str, Any]]:
+def read_fleet_rows(target: Path) -> dict[str, dict[str, Any]]:
     """Read the rows of the runs of an earlier call, by name."""
     table = read_table(target / "index.parquet", content=RUNS)
     records: Any = [] if table is None else table.to_dict("records")

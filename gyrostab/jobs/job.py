@@ -103,7 +103,7 @@ def describe_inputs(paths: Sequence[Path]) -> list[dict[str, Any]]:
 def make_fingerprint(paths: Sequence[Path], options: Mapping[str, Any]) -> dict[str, Any]:
     """Collect all that a product depends on: inputs in order, options, versions and machine.
 
-    `gyrostab.jobs.load.check_options` describes the options; fitting is None without a fit.
+    `gyrostab.jobs.load.check_run_options` describes the options; fitting is None without a fit.
     """
     plain = {**options["reading"], **options["windows"]}
     plain |= {f"fit {name}": value for name, value in (options["fitting"] or {}).items()}

@@ -14,7 +14,7 @@ from gyrostab.errors import OptionError
 from gyrostab.jobs.job import format_option
 
 
-def check_options(
+def check_run_options(
     *,
     reading: Mapping[str, Any] | None = None,
     windows: Mapping[str, Any] | None = None,
@@ -148,6 +148,6 @@ def load_log(
     return log
 
 
-def count_samples(log: xr.Dataset) -> int:
+def count_axis_samples(log: xr.Dataset) -> int:
     """Count the samples of a log over all its axes."""
     return int(log.sizes["axis"] * log.sizes["time"])

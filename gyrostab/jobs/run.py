@@ -15,7 +15,7 @@ import xarray as xr
 
 from gyrostab.errors import FormatError, GyrostabError, OutputError, ResumeError
 from gyrostab.io.datasets import to_netcdf, to_zarr
-from gyrostab.jobs.checkpoint import assemble, find_blocks
+from gyrostab.jobs.checkpoint import assemble_blocks, find_blocks
 from gyrostab.jobs.engine import Blocks, compute_blocks, compute_part, find_record_bands
 from gyrostab.jobs.job import (
     begin_job,
@@ -33,8 +33,8 @@ from gyrostab.jobs.job import (
     remove_job,
     remove_remains,
 )
-from gyrostab.jobs.load import check_options
-from gyrostab.jobs.load import count_samples as count_samples
+from gyrostab.jobs.load import check_run_options
+from gyrostab.jobs.load import count_axis_samples as count_axis_samples
 from gyrostab.jobs.load import load_log as load_log
 from gyrostab.jobs.schedule import Pool, check_scheduler, open_pool
 from gyrostab.kernels.workspace import Workspaces
@@ -124,7 +124,7 @@ def run(
         When interrupted; the message says how much is done.
     """
     scheduler = check_scheduler(scheduler)
-    options = check_options(reading=reading, windows=windows, fitting=fitting)
+    options = check_run_options(reading=reading, windows=windows, fitting=fitting)
     if surface_only:
         options["fitting"] = None
     with protect_inputs(paths), protect_inputs(options["reading"].get("channel", ())):
@@ -363,7 +363,7 @@ def _write_product(job: _Job, blocks: Blocks, *, overwrite: bool, stage: Stage) 
     """
     import dask
 
-    product = assemble([blocks[number] for number in sorted(blocks)])
+    product = assemble_blocks([blocks[number] for number in sorted(blocks)])
     product = product.assign_attrs(gyrostab_job=job.name)
     n_lazy = sum(variable.chunks is not None for variable in product.variables.values())
 

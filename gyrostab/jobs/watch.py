@@ -31,7 +31,7 @@ from gyrostab.jobs.alarms import Alarm, check_alarms, describe_windows
 from gyrostab.jobs.engine import compute_part, find_record_bands
 from gyrostab.jobs.follow import FileMemory, FileStates, RowKeeper, hash_samples, list_files
 from gyrostab.jobs.job import describe_differences, lock_output, make_fingerprint
-from gyrostab.jobs.load import check_options, load_log
+from gyrostab.jobs.load import check_run_options, load_log
 from gyrostab.kernels.workspace import Workspace
 from gyrostab.schema import escape_text, log_channels, signal_name, texts
 from gyrostab.store.lazy import find_source
@@ -135,7 +135,7 @@ def watch(
         When no window could be computed until the end.
     """
     windows = {"window": "10min", **(windows or {})}
-    options = check_options(reading=reading, windows=windows, fitting=fitting)
+    options = check_run_options(reading=reading, windows=windows, fitting=fitting)
     return_large_arrays()
     wait = duration_seconds(lateness, "--lateness") if lateness else 0.0
     quiet = duration_seconds(idle, "--idle") if idle else np.inf

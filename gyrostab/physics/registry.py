@@ -133,7 +133,7 @@ _SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": HOUR
 _HERTZ = {"mHz": 1e-3, "Hz": 1.0, "kHz": 1e3, "MHz": 1e6, "1/min": 1 / 60}
 
 
-def is_number(value: Any) -> TypeGuard[float]:
+def is_model_number(value: Any) -> TypeGuard[float]:
     """Test whether a value of a model is a number, which true and false are not."""
     return isinstance(value, Real) and not isinstance(value, bool)
 

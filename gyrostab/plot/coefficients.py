@@ -16,7 +16,7 @@ from gyrostab.plot.style import (
     axis_names,
     axis_style,
     draws_figure,
-    find_runs,
+    find_true_runs,
     is_narrow,
     label_log_axis,
     new_figure,
@@ -76,7 +76,7 @@ def plot_coefficients(
             _draw_axis(panel, product.sel(axis=name), symbol, name, axis_style(product, name))
             hidden = product["observable"].sel(axis=name, term=symbol).values == NOT_OBSERVABLE
             if hidden.any():
-                first, last = find_runs(hidden)
+                first, last = find_true_runs(hidden)
                 shade_spans(panel, edges[first], edges[last], alpha=0.6 / len(names))
         _set_scale(panel, product, symbol, names)
         panel.set_ylabel(f"{symbol} {unit_label(law.label)}")
@@ -113,7 +113,7 @@ def _draw_axis(
     marks = style | {"markersize": 3.5 if few else 2.5, "linewidth": 1.0}
     panel.plot(time, value, **(marks if few else marks | {"marker": ""}), label=name)
     if not few:  # a single point does not make a line
-        first, end = find_runs(np.isfinite(value))
+        first, end = find_true_runs(np.isfinite(value))
         single = first[end - first == 1]
         panel.plot(time[single], value[single], **marks | {"linestyle": "none", "markersize": 2.0})
     if few:

@@ -17,7 +17,7 @@ from gyrostab.plot.style import (
     axis_names,
     axis_style,
     draws_figure,
-    find_runs,
+    find_true_runs,
     new_figure,
     shade_spans,
     time_axis,
@@ -172,5 +172,5 @@ def _find_gaps(log: xr.Dataset, columns: int) -> tuple[Array, Array]:
     for number in range(signal.sizes["axis"]):
         times, low, _ = thin(signal[number], columns=columns)
         missing.append(np.isnan(low))
-    first, last = find_runs(np.all(missing, axis=0))
+    first, last = find_true_runs(np.all(missing, axis=0))
     return times[first], np.append(times, log["time"].values[-1])[last]

@@ -270,7 +270,7 @@ def time_axis(ax: Axes, times: Array) -> None:
         ax.set_xlim(times[0], times[-1])
 
 
-def find_runs(mask: Array) -> tuple[Array, Array]:
+def find_true_runs(mask: Array) -> tuple[Array, Array]:
     """Find the first index of each run of True, and the index after its last."""
     edges = np.flatnonzero(np.diff(mask, prepend=False, append=False))
     return edges[::2], edges[1::2]

@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab.arrays import Floats
 from gyrostab.noise import NORMAL_95
-from gyrostab.plot.style import COLOURS, axis_names, axis_style, find_runs
+from gyrostab.plot.style import COLOURS, axis_names, axis_style, find_true_runs
 from gyrostab.plot.surface import CHANGE_CMAP
 from gyrostab.report.charts import (
     DEVIATION_LABEL,
@@ -181,7 +181,7 @@ def _band_outline(x: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats]
     """
     present = np.isfinite(low) & np.isfinite(high)
     place, edge = [x[:0]], [low[:0]]
-    for part in map(slice, *find_runs(present)):
+    for part in map(slice, *find_true_runs(present)):
         place += [x[part], x[part][::-1], x[part][:1]]
         edge += [low[part], high[part][::-1], np.full(1, np.nan)]
     return np.concatenate(place), np.concatenate(edge)

@@ -16,7 +16,7 @@ import numpy as np
 from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import OptionError
 from gyrostab.physics.base import STAGES, Chunk, Effect, Setup
-from gyrostab.simulate.drivers import Source
+from gyrostab.simulate.drivers import DriverChannel
 from gyrostab.simulate.noise import NoiseState, Units, draw, shape
 from gyrostab.time.grid import grid_times
 from gyrostab.units import HOUR
@@ -39,7 +39,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Plan:
+class SimulationPlan:
     """Constant properties of a simulation."""
 
     rate: float  # sampling rate of the log [Hz]
@@ -48,7 +48,7 @@ class Plan:
     axes: tuple[str, ...]
     coefficients: tuple[Mapping[str, float], ...]  # noise coefficients of each axis
     steps: tuple[Step, ...]  # the effects, in the order in which they act
-    sources: Mapping[str, Source]  # channels that are needed, by their names in the log
+    sources: Mapping[str, DriverChannel]  # channels that are needed, by their names in the log
     #: Axis that feels the channel ``rotation_rate``, also one that is not simulated; empty when
     #: none does.
     turning: str
@@ -69,7 +69,7 @@ class BlockState:
 
 
 def next_block(
-    plan: Plan, state: BlockState, first: int, count: int, units: Sequence[Units]
+    plan: SimulationPlan, state: BlockState, first: int, count: int, units: Sequence[Units]
 ) -> tuple[Floats, BlockState]:
     """Make the samples ``first`` to ``first + count`` of a log.
 
@@ -150,7 +150,7 @@ def next_block(
 
 
 def _add_noise(
-    plan: Plan,
+    plan: SimulationPlan,
     state: BlockState,
     numbers: list[int],
     act: Any,
@@ -197,7 +197,7 @@ def _add_noise(
 
 
 def _sample_log(
-    plan: Plan,
+    plan: SimulationPlan,
     numbers: list[int],
     act: Any,
     signal: Floats,
@@ -227,7 +227,7 @@ def _sample_log(
     )
 
 
-def _drop_gaps(plan: Plan, rate: Floats, first: int) -> None:
+def _drop_gaps(plan: SimulationPlan, rate: Floats, first: int) -> None:
     """Put NaN into the gaps."""
     count = rate.shape[1]
     for begin, end in plan.gaps[
@@ -297,7 +297,11 @@ class _Log:
     """Blocks of a log: one chain of random numbers per axis, and the chain of the blocks."""
 
     def __init__(
-        self, plan: Plan, state: BlockState, starts: Sequence[NoiseState], counts: Sequence[int]
+        self,
+        plan: SimulationPlan,
+        state: BlockState,
+        starts: Sequence[NoiseState],
+        counts: Sequence[int],
     ):
         self.plan = plan
         self.firsts, self.counts = np.concatenate([[0], np.cumsum(counts)]).tolist(), list(counts)
@@ -328,7 +332,7 @@ def _make_rates(log: _Log, number: int, made: Any) -> Floats:
 
 
 def lazy_rates(
-    plan: Plan, state: BlockState, starts: Sequence[NoiseState], size: int, *, chunk: int
+    plan: SimulationPlan, state: BlockState, starts: Sequence[NoiseState], size: int, *, chunk: int
 ) -> Any:
     """Make the rates of a whole log, block by block.
 

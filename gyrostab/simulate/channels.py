@@ -137,7 +137,7 @@ def channel(
             f"channel {name!r}: the sensor rate {sensor_rate!r} must be a number of Hz "
             "above 0 and up to 1e5"
         )
-    size = count_samples(duration_seconds(duration, "duration"), sensor_rate)
+    size = count_channel_samples(duration_seconds(duration, "duration"), sensor_rate)
     dim = f"time_{name}"
     attrs = {"units": unit, "long_name": name.replace("_", " "), **(attributes or {})}
     coordinates = time_coordinate(stamp_ns(start), sensor_rate, size, name=dim)
@@ -146,7 +146,7 @@ def channel(
     )
 
 
-def count_samples(seconds: float, sensor_rate: float) -> int:
+def count_channel_samples(seconds: float, sensor_rate: float) -> int:
     """Return the samples of a channel from the start of a log to its end, or the first after it."""
     return math.ceil(seconds * sensor_rate - 1e-6) + 1
 

@@ -26,15 +26,15 @@ from gyrostab.schema import (
     signal_name,
 )
 from gyrostab.schema.delays import move_channels
-from gyrostab.simulate.block import BlockState, Plan, Step, lazy_rates
+from gyrostab.simulate.block import BlockState, SimulationPlan, Step, lazy_rates
 from gyrostab.simulate.channels import combine
-from gyrostab.simulate.drivers import Source, make_course, make_source
+from gyrostab.simulate.drivers import DriverChannel, make_course, make_source
 from gyrostab.simulate.frame import (
     RESTART,
     Frame,
     add_environment,
     check_axes,
-    gap_table,
+    convert_gaps,
     make_frame,
     take_environment,
 )
@@ -51,7 +51,7 @@ _COURSE = "course of "  # source of an effect, in front of the name of a recorde
 
 
 class GapTables(NamedTuple):
-    """Gaps of the log by `gap_table`, in which gaps that overlap are one."""
+    """Gaps of the log by `convert_gaps`, in which gaps that overlap are one."""
 
     all: Ints
     restarts: Ints  # losses of power, without other gaps that overlap them
@@ -131,9 +131,9 @@ def simulate(
         environment = combine(*([] if like is None else [take_environment(like)]), added)
         environment = environment.drop_attrs(deep=False)
         tables = GapTables(
-            gap_table(environment, frame),
-            gap_table(environment, frame, only=RESTART),
-            gap_table(added, frame),
+            convert_gaps(environment, frame),
+            convert_gaps(environment, frame, only=RESTART),
+            convert_gaps(added, frame),
         )
         plan = _make_plan(made, frame, environment, tables, like)
         starts = [
@@ -204,7 +204,7 @@ def _convert_units(effect: Effect, environment: xr.Dataset, present: list[str]) 
 
 def _make_plan(
     model: Model, frame: Frame, environment: xr.Dataset, tables: GapTables, like: xr.Dataset | None
-) -> Plan:
+) -> SimulationPlan:
     present = log_channels(environment)
     for name in model.delay:
         if name not in present:
@@ -232,7 +232,7 @@ def _make_plan(
     if turning:
         needed.add("rotation_rate")
     recorded = _recorded_rates(model, steps, like)
-    return Plan(
+    return SimulationPlan(
         rate=frame.rate,
         oversampling=frame.oversampling,
         start=frame.start,
@@ -266,9 +266,11 @@ def _choose_sources(effect: Effect, measured: list[str]) -> dict[str, str]:
     }
 
 
-def _recorded_rates(model: Model, steps: list[Step], like: xr.Dataset | None) -> dict[str, Source]:
+def _recorded_rates(
+    model: Model, steps: list[Step], like: xr.Dataset | None
+) -> dict[str, DriverChannel]:
     """The recorded rates that effects need, by axis."""
-    sources: dict[str, Source] = {}
+    sources: dict[str, DriverChannel] = {}
     for effect in (step.effect for step in steps):
         for axis in effect.recorded_axes():
             if like is None or signal_name(like) != "rate":
@@ -286,7 +288,7 @@ def _recorded_rates(model: Model, steps: list[Step], like: xr.Dataset | None) ->
     return sources
 
 
-def _noise_terms(plan: Plan, row: int) -> str:
+def _noise_terms(plan: SimulationPlan, row: int) -> str:
     """Noise terms of an axis that some stretch may hold."""
     changed = "".join(
         step.effect.terms
@@ -296,7 +298,7 @@ def _noise_terms(plan: Plan, row: int) -> str:
     return "".join(term for term in "QNBK" if plan.coefficients[row][term] > 0.0 or term in changed)
 
 
-def _begin_states(plan: Plan, seed: int) -> BlockState:
+def _begin_states(plan: SimulationPlan, seed: int) -> BlockState:
     counts: dict[str, int] = {}
     states = []
     for step in plan.steps:

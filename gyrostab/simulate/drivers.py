@@ -27,7 +27,7 @@ LEAST_POWER_SHARE = 0.01  # of the median, below which a light power is a fault;
 
 
 @dataclass(frozen=True)
-class Source:
+class DriverChannel:
     """A channel that can be interpolated at any time."""
 
     name: str  # name in the log
@@ -106,7 +106,7 @@ def _first_number(values: Any, name: str) -> float:
     )
 
 
-def make_source(log: xr.Dataset, name: str) -> Source:
+def make_source(log: xr.Dataset, name: str) -> DriverChannel:
     """Prepare a channel of a log for interpolation.
 
     Raises
@@ -129,7 +129,7 @@ def make_source(log: xr.Dataset, name: str) -> Source:
     held = variable.attrs.get("interpolation") == "previous"
     index = log.xindexes.get(dim)
     if data.size > SHORT and isinstance(index, TimeGridIndex):
-        return Source(
+        return DriverChannel(
             name,
             units,
             held,
@@ -145,10 +145,10 @@ def make_source(log: xr.Dataset, name: str) -> Source:
     if not good.any():
         _first_number(values, name)
     stamps = to_nanoseconds(log[dim].values)[good]
-    return Source(name, units, held, stamps, values[good])
+    return DriverChannel(name, units, held, stamps, values[good])
 
 
-def make_course(log: xr.Dataset, name: str) -> Source:
+def make_course(log: xr.Dataset, name: str) -> DriverChannel:
     """Prepare a recorded channel without the noise of its sensor, as the diagnosis sees it.
 
     Means over parts of a quarter of a block are smoothed. Steps that hold have no noise, and remain
@@ -179,7 +179,7 @@ def make_course(log: xr.Dataset, name: str) -> Source:
     return replace(source, stamps=stamps, values=smooth)
 
 
-def _average_parts(source: Source) -> tuple[Ints, Floats]:
+def _average_parts(source: DriverChannel) -> tuple[Ints, Floats]:
     """Return the middles of parts of a channel [ns since 1970], and its means there."""
     if source.stamps is None:
         size, first = source.size, source.start

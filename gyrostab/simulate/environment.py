@@ -21,7 +21,7 @@ from gyrostab.simulate.channels import (
     channel,
     check_points,
     combine,
-    count_samples,
+    count_channel_samples,
     inner_unit,
     piecewise,
 )
@@ -210,7 +210,7 @@ def _to_seconds(value: Any) -> float:
 def _make_temperature(
     name: str, function: Any, seconds: float, start: Any, sensor_rate: float, lag: float
 ) -> xr.Dataset:
-    felt = function(np.arange(count_samples(seconds, sensor_rate)) / sensor_rate)
+    felt = function(np.arange(count_channel_samples(seconds, sensor_rate)) / sensor_rate)
     if lag > 0.0:
         from gyrostab.kernels.thermal import lag_values
 

@@ -12,7 +12,7 @@ import xarray as xr
 
 from gyrostab.arrays import Ints
 from gyrostab.errors import OptionError, SchemaError
-from gyrostab.physics.registry import is_number
+from gyrostab.physics.registry import is_model_number
 from gyrostab.schema import GAP_CAUSES, log_channels
 from gyrostab.simulate.channels import MAX_DURATION_S, combine, convert_units
 from gyrostab.simulate.model import PROFILES, Model
@@ -81,7 +81,7 @@ def make_frame(
                 f"{model.source}: there is no {name}; give {name} = {example} in [log], "
                 f"--{name}, or --like RECORDING"
             )
-    if not (is_number(hertz) and math.isfinite(hertz) and 0 < hertz <= 1e6):
+    if not (is_model_number(hertz) and math.isfinite(hertz) and 0 < hertz <= 1e6):
         raise OptionError(
             f"{model.source}: rate {hertz!r} is not a number of Hz above 0 and up to 1e6"
         )
@@ -229,7 +229,7 @@ def _outside_error(item: str, first: int, last: int, frame: Frame) -> SchemaErro
     )
 
 
-def gap_table(environment: xr.Dataset, frame: Frame, *, only: int | None = None) -> Ints:
+def convert_gaps(environment: xr.Dataset, frame: Frame, *, only: int | None = None) -> Ints:
     """Convert and merge gaps: first missing, first present after, samples, rows, cause.
 
     With the cause `only`, others are left out.

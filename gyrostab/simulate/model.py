@@ -15,7 +15,7 @@ from typing import Any
 from gyrostab.errors import FormatError, GyrostabError, OptionError
 from gyrostab.noise import LAWS, TERMS
 from gyrostab.physics.base import Effect
-from gyrostab.physics.registry import amount, close_to, is_number, make_effect
+from gyrostab.physics.registry import amount, close_to, is_model_number, make_effect
 from gyrostab.simulate import environment, losses
 from gyrostab.simulate.noise import FLICKER_LOW
 from gyrostab.simulate.turning import rotation
@@ -248,7 +248,7 @@ def _read_numbers(
     numbers = {}
     for name, value in tables.get(section, {}).items():
         number = amount(value, unit, f"{where}: {section} of {name}")
-        if not is_number(number) or not abs(number) <= _LARGEST[section]:
+        if not is_model_number(number) or not abs(number) <= _LARGEST[section]:
             raise OptionError(
                 f"{where}, [{section}]: {name} = {value!r} is not a number up to "
                 f"{_LARGEST[section]:g}; give one in {unit} for {owner}"
@@ -265,7 +265,11 @@ def _read_coefficient(term: str, value: Any, where: str) -> float:
             f"there are {listed}, and flicker_band in [noise]"
         )
     number = amount(value, LAWS[term].label, f"{where}: {term}")
-    if not is_number(number) or not abs(number) <= _MAX_COEFFICIENT or (number < 0 and term != "R"):
+    if (
+        not is_model_number(number)
+        or not abs(number) <= _MAX_COEFFICIENT
+        or (number < 0 and term != "R")
+    ):
         raise OptionError(
             f"{where}: {term} = {value!r} is not a number from 0 to {_MAX_COEFFICIENT:g}; give one "
             f"in {LAWS[term].label}"
@@ -388,6 +392,6 @@ def _read_profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[st
     }
     for key, unit in units.items():
         number = converted.get(key, 0.0)
-        if key != "band" and not (is_number(number) and math.isfinite(number)):
+        if key != "band" and not (is_model_number(number) and math.isfinite(number)):
             raise OptionError(f"{where}: {key} = {number!r} is not a number; give one in {unit}")
     return str(name), converted

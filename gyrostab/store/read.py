@@ -26,7 +26,7 @@ from gyrostab.store.damage import check_blosc_chunks, check_codecs, check_global
 from gyrostab.store.layout import ChunkCache, ChunkDamage, is_readable, read_chunk
 from gyrostab.store.lazy import FileVariable, RowSource, make_dask
 from gyrostab.store.private import close_function
-from gyrostab.store.remote import ROOT_METADATA, find_kind, find_url, reaching
+from gyrostab.store.remote import ROOT_METADATA, find_remote_kind, find_url, reaching
 from gyrostab.store.times import decode_stamps, index_dim, parse_time_grids, replace_stamps
 from gyrostab.wording import list_some
 
@@ -75,7 +75,7 @@ def open_stored(
 
 def _open_remote(path: Path, url: str) -> xr.Dataset:
     """Open a Zarr store at an address; the Zarr library reads its chunks."""
-    if find_kind(url) != "store":
+    if find_remote_kind(url) != "store":
         raise FormatError(f"{url}: is not a Zarr store; copy the file here, and give the copy")
     with reaching(url), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # without consolidated metadata

@@ -121,7 +121,7 @@ def _open_filesystem(
         yield filesystem, str(path).rstrip("/")
 
 
-def find_kind(
+def find_remote_kind(
     url: str, *, required: bool = True, error: type[GyrostabError] = FormatError
 ) -> Literal["store", "folder", "file"] | None:
     """Find what is at an address: a Zarr store, another folder, a file, or nothing.

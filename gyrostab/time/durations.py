@@ -91,6 +91,23 @@ def format_duration(seconds: float, space: str = "") -> str:
     return f"{np.format_float_positional(rounded, trim='-')}{space}{name}"
 
 
+def format_measured_duration(seconds: float) -> str:
+    """Format a length of time that was measured: milliseconds, seconds up to two hours, or hours.
+
+    `format_duration` is for lengths that a user chose.
+
+    Examples
+    --------
+    >>> format_measured_duration(1068.0), format_measured_duration(0.0045)
+    ('1068.0 s', '4.5 ms')
+    >>> format_measured_duration(200 * 3600)
+    '200.0 h'
+    """
+    if abs(seconds) < 1.0:
+        return f"{seconds * 1e3:.3g} ms"
+    return f"{seconds:.1f} s" if abs(seconds) < 7200 else f"{seconds / 3600:.1f} h"
+
+
 def largest_unit(seconds: float) -> tuple[float, str]:
     """Find the largest unit that is at most as long as a length of time, in seconds, and its name.
 

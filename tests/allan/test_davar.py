@@ -18,7 +18,7 @@ from gyrostab.allan.fit import fit_noise
 from gyrostab.errors import OptionError
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.allan.blocks import held_points
-from gyrostab.kernels.allan.surface import Unit, surface_unit
+from gyrostab.kernels.allan.surface import WorkUnit, surface_unit
 from gyrostab.kernels.workspace import Workspace, Workspaces
 from gyrostab.schema import ESTIMATORS
 from tests.reference import direct_angle_surface, direct_surface
@@ -116,7 +116,7 @@ class TestAgainstTheDefinition:
             x[start : start + 90] = np.nan
         ks = np.array([1, 2, 3, 4, 5, 6, 7, 8, 9, 24, 160, longest])
         assert held_points(x.size + 1, step, ks) < x.size / 1.4
-        cells, _ = surface_unit(x, Unit(window, step, ks, False, 0.01, 0.0, 0.0))
+        cells, _ = surface_unit(x, WorkUnit(window, step, ks, False, 0.01, 0.0, 0.0))
         avar, count = direct_surface(x, window, step, list(ks))
         np.testing.assert_array_equal(cells[1], count)
         np.testing.assert_allclose(cells[0], avar, rtol=1e-10)
@@ -339,7 +339,7 @@ class TestGaps:
         x = np.random.default_rng(6).standard_normal(30_000) + 3.0
         x[5000:5800] = x[20_000:20_700] = np.nan
         ks = np.array([1, 30, 200, 300])
-        unit = Unit(1000, 300, ks, False, 0.01, 0.3, 0.1)
+        unit = WorkUnit(1000, 300, ks, False, 0.01, 0.3, 0.1)
         cells, _ = surface_unit(x, unit)
         bridged = np.flatnonzero((cells[4] == WEIGHTED).any(axis=1))
         assert bridged.size >= 8

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gyrostab import davar, fit_noise, make_log
 from gyrostab.allan.variance import surface_columns, variance_name
 from gyrostab.errors import OptionError
-from gyrostab.kernels.allan.surface import Unit, surface_unit
+from gyrostab.kernels.allan.surface import WorkUnit, surface_unit
 from gyrostab.kernels.fit.covariance import product_tables, third_columns
 from gyrostab.noise import sample_squares
 from gyrostab.plot import plot_adev
@@ -65,7 +65,7 @@ def test_cells_are_those_of_direct_sums(variance, seed, window, missing, shock, 
     x[n // 2] += shock if not angle else 0.0
     x[rng.random(n) < missing] = np.nan
     ks = np.array([1, 2, 3, 5])
-    unit = Unit(window, step, ks, angle, 1.0, 0.3, 0.0, variance)
+    unit = WorkUnit(window, step, ks, angle, 1.0, 0.3, 0.0, variance)
     cells, _ = surface_unit(x, unit)
     want, count = direct_sums(x, variance, window, step, ks, angle=angle)
     np.testing.assert_array_equal(np.broadcast_to(cells.count, count.shape), count)
@@ -77,7 +77,7 @@ def test_cells_are_those_of_direct_sums(variance, seed, window, missing, shock, 
 @pytest.mark.parametrize("variance", ["avar", *VARIANCES])
 def test_a_shock_costs_no_digits_of_windows_without_it(variance):
     x, ks = np.random.default_rng(2).standard_normal(120), np.array([1, 2, 3, 5])
-    unit = Unit(30, 6, ks, False, 1.0, 0.3, 0.0, variance)
+    unit = WorkUnit(30, 6, ks, False, 1.0, 0.3, 0.0, variance)
     want = surface_unit(x, unit)[0].avar
     x[60] = 1e9
     cells = surface_unit(x, unit)[0].avar
@@ -143,7 +143,7 @@ def noise_record(rng, shape, *, q=0.0, n=0.0, k=0.0):
 @pytest.mark.parametrize(("term", "place"), [("q", 0), ("n", 1), ("k", 3)])
 def test_mean_and_scatter_are_those_of_the_tables(variance, term, place):
     count, window, ks = 3000, 400, np.array([1, 3, 10, 40, 88])
-    unit = Unit(window, window, ks, False, 1.0, 0.3, 0.0, variance)
+    unit = WorkUnit(window, window, ks, False, 1.0, 0.3, 0.0, variance)
     records = noise_record(np.random.default_rng(7), (count, window), **{term: 1.0})
     cells = np.concatenate([surface_unit(x, unit)[0].avar for x in records])
     want = product_tables(window, ks, variance=variance)[0][place, place]
@@ -162,7 +162,7 @@ def test_degrees_of_freedom_with_gaps_are_those_of_simulated_records(variance):
     ks = np.array([1, 5, 20, 40])
     x = rng.standard_normal((3000, window))
     x[:, lost] = np.nan
-    unit = Unit(window, window, ks, False, 1.0, 0.0, 0.0, variance)
+    unit = WorkUnit(window, window, ks, False, 1.0, 0.0, 0.0, variance)
     surfaces = [surface_unit(row, unit)[0] for row in x]
     avar = np.concatenate([cells.avar for cells in surfaces])
     pairs, _ = product_tables(window, ks, variance=variance)

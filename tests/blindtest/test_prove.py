@@ -25,7 +25,7 @@ from gyrostab.blindtest.runner.folder import (
     inspect_folder,
     read_sums,
 )
-from gyrostab.blindtest.runner.outcome import _thin_out, page_text, score_rows
+from gyrostab.blindtest.runner.outcome import _thin_out, format_outcome, score_rows
 from gyrostab.blindtest.runner.steps import diagnose_case, run_in_processes
 from gyrostab.blindtest.scenarios.injection import RECORDINGS
 from gyrostab.blindtest.scenarios.plan import plan_case
@@ -466,7 +466,7 @@ def test_wrong_names_on_null_records_are_listed():
         "machine": "any",
     }
     table = score_table(rows)
-    text = page_text(rows, table, job=job, commitment="0" * 64, failed={})
+    text = format_outcome(rows, table, job=job, commitment="0" * 64, failed={})
     assert "abc (null, 10 Hz, 10 min, 0 % lost): no effect; named shupe" in text
     assert "--real DIR`" in text
     assert "not for publication" not in text
@@ -489,7 +489,7 @@ def test_a_wrong_name_is_listed_with_all_effects_of_its_record():
     rows = score_rows({"abc": answer}, {"abc": truth}, {"abc": {}})
     job = dict.fromkeys(("injected", "cases", "seed", "nulls", "counterparts"), 1)
     job |= {"code": ["a"], "begun": "now", "machine": "any"}
-    text = page_text(rows, score_table(rows), job=job, commitment="", failed={})
+    text = format_outcome(rows, score_table(rows), job=job, commitment="", failed={})
     assert text.replace("\n ", "").count("shupe at 2 and spikes at 2; named spectral_line") == 1
 
 

@@ -26,7 +26,7 @@ from gyrostab.jobs.archive import Archive, LogRun, find_archive, find_runs
 from gyrostab.jobs.fleet import process_run, run_fleet, write_file_table
 from gyrostab.jobs.fleet_table import TREND_COLUMNS, read_table, write_table
 from gyrostab.jobs.job import begin_job, job_folder, make_fingerprint
-from gyrostab.jobs.load import check_options
+from gyrostab.jobs.load import check_run_options
 from gyrostab.jobs.run import run
 from gyrostab.jobs.schedule import open_pool
 from gyrostab.report.fleet import write_overview
@@ -480,7 +480,7 @@ def test_finished_parts_of_a_run_are_kept(tmp_path):
     output = tmp_path / "out.zarr"
     folder = job_folder(output)
     folder.mkdir()
-    begin_job(folder, make_fingerprint([], check_options()), parts=5, overwrite=False)
+    begin_job(folder, make_fingerprint([], check_run_options()), parts=5, overwrite=False)
     (folder / "windows-0000000000.block").write_bytes(b"an hour of work")
     with pytest.raises(ResumeError, match=r"out\.zarr: a run of it.*1 of 5 parts.*--resume"):
         run_fleet([tmp_path / "in"], output, **OPTIONS)

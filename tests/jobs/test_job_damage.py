@@ -17,7 +17,7 @@ from gyrostab.jobs.job import (
     read_job,
     remove_remains,
 )
-from gyrostab.jobs.load import check_options
+from gyrostab.jobs.load import check_run_options
 
 
 def flip(content: bytes, place: int, bit: int) -> bytes:
@@ -27,7 +27,7 @@ def flip(content: bytes, place: int, bit: int) -> bytes:
 def test_a_flipped_bit_in_the_description_of_a_run_is_noticed(tmp_path):
     begin_job(
         tmp_path,
-        make_fingerprint([tmp_path], check_options(windows={"window": "10min"})),
+        make_fingerprint([tmp_path], check_run_options(windows={"window": "10min"})),
         parts=5,
         overwrite=False,
     )

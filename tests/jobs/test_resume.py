@@ -336,11 +336,11 @@ def test_a_log_is_not_mistaken_for_a_file_of_channels(tmp_path, capfd):
 def test_a_zarr_store_with_a_changed_chunk_is_noticed(log, tmp_path):
     from gyrostab import to_zarr
     from gyrostab.jobs.job import describe_differences, make_fingerprint
-    from gyrostab.jobs.load import check_options
+    from gyrostab.jobs.load import check_run_options
 
     store = to_zarr(open_log(log), tmp_path / "run7.zarr")
-    before = make_fingerprint([store], check_options())
-    assert describe_differences(before, make_fingerprint([store], check_options())) == ""
+    before = make_fingerprint([store], check_run_options())
+    assert describe_differences(before, make_fingerprint([store], check_run_options())) == ""
     chunk = next(
         path for path in sorted((store / "rate").iterdir()) if not path.name.startswith(".")
     )
@@ -348,7 +348,7 @@ def test_a_zarr_store_with_a_changed_chunk_is_noticed(log, tmp_path):
         chunk = next(chunk.iterdir())
     _touched(chunk)
     assert "run7.zarr has changed" in describe_differences(
-        before, make_fingerprint([store], check_options())
+        before, make_fingerprint([store], check_run_options())
     )
 
 

@@ -28,7 +28,7 @@ from gyrostab.jobs import watch as module
 from gyrostab.jobs.alarms import check_alarms, parse_alarm
 from gyrostab.jobs.job import begin_job, job_folder, make_fingerprint
 from gyrostab.jobs.live_page import LivePage
-from gyrostab.jobs.load import check_options
+from gyrostab.jobs.load import check_run_options
 from gyrostab.jobs.run import run
 from gyrostab.jobs.watch import rows_folder, watch
 
@@ -178,7 +178,7 @@ def test_a_file_that_comes_late_changes_earlier_windows(rows, tmp_path):
 def test_a_file_that_is_cut_is_followed_on(tmp_path):
     rows, recorder = make_rows(12_000), Recorder()
     source, output = tmp_path / "log.csv", tmp_path / "live.zarr"
-    view = module._View(output, check_options(windows=WINDOWS), {}, 0.0, [], recorder, None)
+    view = module._View(output, check_run_options(windows=WINDOWS), {}, 0.0, [], recorder, None)
     for count in (8_000, 5_000, 6_500, 12_000):
         source.write_text(HEADER + "".join(rows[:count]))
         view.take_files(follow_module.list_files(str(source)))
@@ -197,7 +197,7 @@ def test_a_product_of_another_record_is_replaced_as_a_whole(tmp_path):
     """A store that is rewritten in place would have windows of both after a kill."""
     rows, stores = make_rows(8_000), []
     source, output = tmp_path / "log.csv", tmp_path / "live.zarr"
-    view = module._View(output, check_options(windows=WINDOWS), {}, 0.0, [], Recorder(), None)
+    view = module._View(output, check_run_options(windows=WINDOWS), {}, 0.0, [], Recorder(), None)
     for count in (5_000, 6_500, 4_000, 8_000):
         source.write_text(HEADER + "".join(rows[:count]))
         view.take_files(follow_module.list_files(str(source)))
@@ -357,7 +357,7 @@ def test_finished_parts_of_a_run_and_foreign_files_are_kept(tmp_path):
         follow(source, output)
     assert [path.name for path in folder.iterdir()] == ["thesis.txt"]
     (folder / "thesis.txt").unlink()
-    begin_job(folder, make_fingerprint([], check_options()), parts=5, overwrite=False)
+    begin_job(folder, make_fingerprint([], check_run_options()), parts=5, overwrite=False)
     (folder / "windows-0000000000.block").write_bytes(b"an hour of work")
     with pytest.raises(ResumeError, match=r"a\.zarr: a run of it.*1 of 5 parts.*--resume"):
         follow(source, output)

@@ -36,7 +36,7 @@ def test_a_long_channel_does_not_depend_on_the_chunks(cuts, rate, held, seed):
     values[rng.random(values.size) < 0.2] = np.nan
     values[rng.integers(values.size)] = 1.0
     good = ~np.isnan(values)
-    source = drivers.Source(
+    source = drivers.DriverChannel(
         "a",
         "1",
         held,

@@ -19,7 +19,7 @@ from gyrostab.blindtest.generator import (
 )
 from gyrostab.blindtest.generator.detection_limits import NATS, fitted_nats
 from gyrostab.blindtest.generator.record import UNITS
-from gyrostab.blindtest.generator.scenario import Effect, Scenario
+from gyrostab.blindtest.generator.scenario import HiddenEffect, Scenario
 
 _ROUNDS = 30  # at most, to raise a strength in fitted noise: that of slow effects grows slowly
 _MARGIN = 1.02  # of the strength above that proportion
@@ -35,7 +35,7 @@ class Entry:
     can be invisible in the raw trace and the Allan plot, yet identifiable.
     """
 
-    draw: Callable[..., Effect]
+    draw: Callable[..., HiddenEffect]
     driver: str | None = None
     cuts: int = 0
     needs: str = ""
@@ -53,7 +53,7 @@ class Entry:
         *,
         strength: float,
         in_fitted_noise: bool = False,
-    ) -> Effect:
+    ) -> HiddenEffect:
         """Draw the effect at a strength in known noise, or at least at this one in fitted noise.
 
         Its strength in known noise is at most `_MAX_FACTOR` times larger: a filter of a quantized

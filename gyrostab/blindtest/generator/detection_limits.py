@@ -23,7 +23,7 @@ from scipy.optimize import minimize
 
 from gyrostab.arrays import Floats
 from gyrostab.blindtest.generator.noise import BANDS, floor_psd, white_level
-from gyrostab.blindtest.generator.scenario import Effect, Scenario, count_per_second
+from gyrostab.blindtest.generator.scenario import HiddenEffect, Scenario, count_per_second
 from gyrostab.errors import OptionError
 
 #: Log-likelihood at the limit.
@@ -100,7 +100,7 @@ def learned_nats(scenario: Scenario, mean: Floats) -> float:
     )
 
 
-def fitted_nats(scenario: Scenario, effect: Effect) -> float:
+def fitted_nats(scenario: Scenario, effect: HiddenEffect) -> float:
     """Return the evidence expected for an effect over noise fitted without it [nats]."""
     learned = effect.learned_nats
     if learned is None and effect.mean is not None:

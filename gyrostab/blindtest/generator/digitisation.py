@@ -10,11 +10,13 @@ import numpy as np
 from gyrostab.arrays import Floats
 from gyrostab.blindtest.generator import instrument
 from gyrostab.blindtest.generator.detection_limits import NATS, NATS_PER_SAMPLE
-from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario
+from gyrostab.blindtest.generator.scenario import AXES, HiddenEffect, Scenario
 from gyrostab.blindtest.generator.shapes import make_variance_effect, sample_sd
 
 
-def rate_quantization(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def rate_quantization(
+    scenario: Scenario, rng: np.random.Generator, *, strength: float
+) -> HiddenEffect:
     """Draw a rate that is rounded or truncated to steps, sized by the white noise the steps add.
 
     Every sample is on the grid of the steps, which shows them at any size.
@@ -38,7 +40,7 @@ def rate_quantization(scenario: Scenario, rng: np.random.Generator, *, strength:
     return replace(effect, after=after, parameters={"step": {"value": step, "unit": "deg/h"}})
 
 
-def dead_zone(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def dead_zone(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a closed loop that holds rates near zero at zero, on one axis at zero mean rate."""
     axis = int(rng.integers(3))
     share = NATS * strength**2 / NATS_PER_SAMPLE / float((~scenario.missing).sum())
@@ -48,12 +50,12 @@ def dead_zone(scenario: Scenario, rng: np.random.Generator, *, strength: float) 
 
     def after(record: Floats) -> Floats:
         out = record.copy()
-        out[axis] = instrument.dead_zone(
+        out[axis] = instrument.apply_dead_zone(
             record[axis] - np.nanmean(np.where(scenario.missing, np.nan, record[axis])), width=width
         )
         return out
 
-    return Effect(
+    return HiddenEffect(
         axes=(AXES[axis],),
         form="held at zero, and pulled softly beyond",
         form_differs=True,
@@ -65,7 +67,7 @@ def dead_zone(scenario: Scenario, rng: np.random.Generator, *, strength: float) 
     )
 
 
-def clipping(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def clipping(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a range that clips one axis on one side or both, with a hard edge or a soft knee."""
     axis = int(rng.integers(3))
     equal = max(1, round(NATS * strength**2 / NATS_PER_SAMPLE))  # to another one
@@ -87,7 +89,7 @@ def clipping(scenario: Scenario, rng: np.random.Generator, *, strength: float) -
         out[axis] = np.clip(row, low, high)
         return out
 
-    return Effect(
+    return HiddenEffect(
         axes=(AXES[axis],),
         form=("on both sides" if is_two_sided else "above")
         + (", with a soft knee" if soft else ""),

@@ -21,7 +21,7 @@ from gyrostab.blindtest.generator.detection_limits import (
 )
 from gyrostab.blindtest.generator.environment import lag
 from gyrostab.blindtest.generator.noise import BANDS
-from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
+from gyrostab.blindtest.generator.scenario import AXES, HiddenEffect, Scenario, to_samples
 from gyrostab.blindtest.generator.shapes import (
     axes_with_share,
     draw_shares,
@@ -37,7 +37,7 @@ _MAX_SHARE = math.sqrt(0.8)  # of a source in the noise of an axis, as an amplit
 _MAX_FILTER_WEIGHT = 0.45  # of the other samples in the output of a filter
 
 
-def spectral_line(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def spectral_line(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a spectral line of constant phase, or one whose phase wanders slowly."""
     frequency = float(np.exp(rng.uniform(np.log(0.005), np.log(0.48)))) * scenario.rate
     wander = rng.random() < 0.5
@@ -72,7 +72,7 @@ def spectral_line(scenario: Scenario, rng: np.random.Generator, *, strength: flo
     return effect
 
 
-def supply_bias(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def supply_bias(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a bias that follows the supply, in half of the cases slowly and nonlinearly."""
     slow = rng.random() < 0.5
     v = scenario.supply - scenario.supply.mean()
@@ -104,7 +104,7 @@ def supply_bias(scenario: Scenario, rng: np.random.Generator, *, strength: float
     return effect
 
 
-def bias_jump(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def bias_jump(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a bias step after every power cut, in half of the cases with a settling tail."""
     tail = rng.random() < 0.5
     t = np.arange(scenario.temperature.size, dtype=float)
@@ -123,7 +123,9 @@ def bias_jump(scenario: Scenario, rng: np.random.Generator, *, strength: float) 
     )
 
 
-def feedback_reset(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def feedback_reset(
+    scenario: Scenario, rng: np.random.Generator, *, strength: float
+) -> HiddenEffect:
     """Draw an error that follows every imperfect 2 pi reset of the ramp and decays with phase."""
     rate = rng.uniform(0.3, 1.0) * min(15.0, 15.0 * scenario.rate / 8)
     axis = int(rng.integers(3))
@@ -159,7 +161,7 @@ def _low_passed(rng: np.random.Generator, size: int, *, corner: float) -> Floats
     return np.asarray(common / common.std())
 
 
-def shared_source(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def shared_source(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw excess noise of one source in all axes; no single axis shows it."""
     coloured = rng.random() < 0.5
     corner = rng.uniform(0.3, 0.8) if coloured else math.inf
@@ -174,7 +176,7 @@ def shared_source(scenario: Scenario, rng: np.random.Generator, *, strength: flo
 
     shares = shares * min(amplitude_for(size_of, strength, first=1e-2), _MAX_SHARE)
     size = shared_size(scenario, shares, power)
-    return Effect(
+    return HiddenEffect(
         axes=axes_with_share(shares),
         form=f"common noise low-passed at {corner:.2f} of Nyquist"
         if coloured
@@ -201,7 +203,7 @@ def shared_source(scenario: Scenario, rng: np.random.Generator, *, strength: flo
     )
 
 
-def logger_filter(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def logger_filter(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw an undocumented short smoothing filter in the logger."""
     kind = str(rng.choice(["three", "pole", "mean"]))
 
@@ -259,7 +261,7 @@ def logger_filter(scenario: Scenario, rng: np.random.Generator, *, strength: flo
     return replace(effect, after=after, parameters=parameters, learned_nats=learned)
 
 
-def spikes(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def spikes(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw flipped bits; a spike is worth its chi-square less the log of its possible places."""
     axis = int(rng.integers(3))
     sd = sample_sd(scenario, axis)
@@ -278,7 +280,7 @@ def spikes(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> 
         out[axis, where] = flipped[where]
         return out
 
-    return Effect(
+    return HiddenEffect(
         axes=(AXES[axis],),
         form=f"{number} flips of bit 12",
         form_differs=True,
@@ -294,7 +296,7 @@ def spikes(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> 
     )
 
 
-def held_samples(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def held_samples(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw repeated frames or samples; few suffice, as noise alone never repeats a value."""
     samples = max(1, round(NATS * strength**2 / NATS_PER_SAMPLE))
     number = max(1, round(samples / max(3, int(rng.uniform(0.05, 0.4) * scenario.rate))))
@@ -307,7 +309,7 @@ def held_samples(scenario: Scenario, rng: np.random.Generator, *, strength: floa
         "per_hour": {"value": starts.size / hours, "unit": "1/h"},
         "length": {"value": frame / scenario.rate, "unit": "s"},
     }
-    return Effect(
+    return HiddenEffect(
         axes=AXES,
         form=f"{starts.size} frames of {frame} samples " + ("held" if hold else "sent twice"),
         form_differs=not hold,

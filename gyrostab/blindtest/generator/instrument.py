@@ -174,7 +174,7 @@ def reset_error(phase: Floats, *, settle: float = 0.05) -> Floats:
     return np.asarray(np.exp(-np.asarray(phase) / settle) - mean)
 
 
-def dead_zone(rate: Floats, *, width: float) -> Floats:
+def apply_dead_zone(rate: Floats, *, width: float) -> Floats:
     """Apply a dead zone: crosstalk holds the output at zero below `width` [deg/h]."""
     rate = np.asarray(rate, dtype=float)
     above = np.sqrt(np.maximum(rate**2 - width**2, 0.0))

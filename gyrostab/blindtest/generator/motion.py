@@ -16,7 +16,7 @@ from gyrostab.blindtest.generator.noise import BANDS, white_level
 from gyrostab.blindtest.generator.scenario import (
     AXES,
     ROTATION_STEP_S,
-    Effect,
+    HiddenEffect,
     Scenario,
     to_samples,
 )
@@ -31,7 +31,7 @@ from gyrostab.blindtest.generator.shapes import (
 
 def vibration_rectification(
     scenario: Scenario, rng: np.random.Generator, *, strength: float
-) -> Effect:
+) -> HiddenEffect:
     """Draw a vibration rectification: a power of the rms near 2, with saturation."""
     exponent = 2.0 if rng.random() < 0.4 else float(rng.uniform(1.6, 2.4))
     saturation = float(rng.choice([8.0, 15.0, np.inf, np.inf]))
@@ -90,7 +90,7 @@ def _make_shaking_noise(
     mount: tuple[Floats, Floats],
     kind: str,
     form: str,
-) -> Effect:
+) -> HiddenEffect:
     shares = draw_shares(rng, single_probability=0.4)
     f = (np.arange(BANDS) + 0.5) * scenario.rate / 2 / BANDS
     density = instrument.folded_psd(
@@ -128,7 +128,9 @@ def _make_shaking_noise(
     return replace(effect, extra=extra, parameters=parameters)
 
 
-def vibration_noise(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def vibration_noise(
+    scenario: Scenario, rng: np.random.Generator, *, strength: float
+) -> HiddenEffect:
     """Draw angular vibration in the band of the log, through a resonant mount and a decimator."""
     low = rng.uniform(0.02, 0.1) * scenario.rate
     high = rng.uniform(0.3, 0.6) * scenario.rate
@@ -149,7 +151,9 @@ def vibration_noise(scenario: Scenario, rng: np.random.Generator, *, strength: f
     )
 
 
-def aliased_vibration(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def aliased_vibration(
+    scenario: Scenario, rng: np.random.Generator, *, strength: float
+) -> HiddenEffect:
     """Draw angular vibration above the band of the log, aliased by an insufficient filter."""
     low = rng.uniform(max(1.3 * scenario.rate, 150.0), 900.0)
     high = low + rng.uniform(50.0, 300.0)
@@ -196,7 +200,7 @@ def _is_turning(scenario: Scenario) -> Bools:
     )
 
 
-def earth_rate(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def earth_rate(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a residual earth rate on the cross axes; it is constant while the tool is at rest."""
     x, y = instrument.cross_axis(_draw_toolface(scenario, rng), across=1.0)
     effect = make_mean_effect(
@@ -218,7 +222,7 @@ def earth_rate(scenario: Scenario, rng: np.random.Generator, *, strength: float)
     return effect
 
 
-def rotation_line(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def rotation_line(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw harmonics of the rotation with amplitudes proportional to its rate."""
     angle, shares = _draw_toolface(scenario, rng), draw_shares(rng)
     speed = to_samples(scenario, scenario.rotation / scenario.rotation.max(), dt=ROTATION_STEP_S)
@@ -238,7 +242,7 @@ def rotation_line(scenario: Scenario, rng: np.random.Generator, *, strength: flo
     )
 
 
-def scale_factor(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def scale_factor(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a scale factor error, in half of the cases nonlinear; the log excludes the rotation."""
     bend = rng.random() < 0.5
     w = scenario.rotation / scenario.rotation.max()
@@ -262,7 +266,7 @@ def scale_factor(scenario: Scenario, rng: np.random.Generator, *, strength: floa
     )
 
 
-def misalignment(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def misalignment(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a leak of the rate of z into another axis while the tool turns slowly about z."""
     seconds, t = scenario.seconds, np.arange(scenario.temperature.size, dtype=float)
     turn = np.zeros_like(t)

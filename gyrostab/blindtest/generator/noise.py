@@ -148,12 +148,12 @@ class MeasuredNoise:
         size, wander = change @ weight, self.log_power[axis][present] @ weight
         rate = self.rate / self.block
         density = np.maximum(
-            line_density(wander, rate=rate), 2.0 / (samples * float((gain**2).sum())) / rate
+            smooth_periodogram(wander, rate=rate), 2.0 / (samples * float((gain**2).sum())) / rate
         )
         return 0.5 * float((fft.dct(size, norm="ortho")[1:] ** 2 / rate / density).sum())
 
 
-def line_density(values: Floats, *, rate: float) -> Floats:
+def smooth_periodogram(values: Floats, *, rate: float) -> Floats:
     """Compute the two-sided density [unit2/Hz] of values (time,) at ``k rate / (2 size)``, k >= 1.
 
     The ratio of each line to a fitted slope (white, flicker and random walk) is averaged over 33
@@ -241,7 +241,7 @@ def measure_noise(record: Floats, *, rate: float, axes: int | None = None) -> Me
     Axes that the record lacks of the number `axes` repeat the first.
     """
     block = max(math.ceil(rate), _MIN_BLOCK_SAMPLES)
-    lines = np.stack([line_density(row, rate=rate) for row in record])
+    lines = np.stack([smooth_periodogram(row, rate=rate) for row in record])
     powers = np.log(np.stack([_block_powers(row, rate=rate, block=block) for row in record]))
     half = (
         block / BANDS / _LINES_PER_INDEPENDENT

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from gyrostab.blindtest.generator.environment import lag
-from gyrostab.blindtest.generator.scenario import Effect, Scenario, stream, to_samples
+from gyrostab.blindtest.generator.scenario import HiddenEffect, Scenario, stream, to_samples
 from gyrostab.blindtest.generator.shapes import (
     axes_with_share,
     draw_shares,
@@ -18,7 +18,9 @@ from gyrostab.blindtest.generator.shapes import (
 )
 
 
-def breathing_noise(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def breathing_noise(
+    scenario: Scenario, rng: np.random.Generator, *, strength: float
+) -> HiddenEffect:
     """Draw a periodic noise level without a driver."""
     period = rng.uniform(0.05, 0.2) * scenario.seconds
     t = np.arange(scenario.temperature.size)
@@ -40,7 +42,7 @@ def breathing_noise(scenario: Scenario, rng: np.random.Generator, *, strength: f
     return effect
 
 
-def chirped_line(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def chirped_line(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a line that drifts through a part of the band."""
     low, high = np.sort(rng.uniform(0.05, 0.4, 2)) * scenario.rate
     t = np.arange(scenario.size) / scenario.rate
@@ -58,7 +60,7 @@ def chirped_line(scenario: Scenario, rng: np.random.Generator, *, strength: floa
     )
 
 
-def slow_memory(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def slow_memory(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a bias that follows hidden doses and decays as a power of time."""
     dose = rng.random(scenario.temperature.size) < 4.0 / scenario.seconds
     dose[int(rng.uniform(0.1, 0.6) * dose.size)] = True
@@ -76,7 +78,7 @@ def slow_memory(scenario: Scenario, rng: np.random.Generator, *, strength: float
     )
 
 
-def three_levels(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def three_levels(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a bias that switches between three levels."""
     dwell = rng.uniform(0.03, 0.1) * scenario.seconds
     switches = rng.random(scenario.temperature.size) < 1 / dwell
@@ -98,7 +100,9 @@ def three_levels(scenario: Scenario, rng: np.random.Generator, *, strength: floa
     )
 
 
-def informative_gaps(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def informative_gaps(
+    scenario: Scenario, rng: np.random.Generator, *, strength: float
+) -> HiddenEffect:
     """Draw a noise level that rises together with the loss of frames."""
     trouble = lag(
         np.abs(

@@ -16,7 +16,7 @@ from gyrostab.blindtest.generator.environment import read_sensor
 from gyrostab.blindtest.generator.scenario import (
     AXES,
     ROTATION_STEP_S,
-    Effect,
+    HiddenEffect,
     Scenario,
     stream,
     to_samples,
@@ -40,7 +40,7 @@ UNITS = {
 
 
 def draw_base_noise(
-    scenario: Scenario, rng: np.random.Generator, effects: Sequence[Effect] = ()
+    scenario: Scenario, rng: np.random.Generator, effects: Sequence[HiddenEffect] = ()
 ) -> Floats:
     """Draw the base noise (axis, time) [deg/h], with the white noise that the effects imply."""
     rows = []
@@ -62,7 +62,7 @@ def draw_base_noise(
     return np.stack(rows)
 
 
-def make_record(scenario: Scenario, effects: Sequence[Effect], *, seed: int) -> Floats:
+def make_record(scenario: Scenario, effects: Sequence[HiddenEffect], *, seed: int) -> Floats:
     """Make the rates (axis, time) [deg/h]; for one seed the noise is the same without effects."""
     record = draw_base_noise(scenario, stream(seed, "noise"), effects) + stream(
         seed, "level"
@@ -88,7 +88,7 @@ def make_record(scenario: Scenario, effects: Sequence[Effect], *, seed: int) -> 
     return record
 
 
-def find_missing(scenario: Scenario, effects: Sequence[Effect]) -> Bools:
+def find_missing(scenario: Scenario, effects: Sequence[HiddenEffect]) -> Bools:
     """Mark the missing samples."""
     gone = scenario.missing.copy()
     for effect in effects:
@@ -98,7 +98,7 @@ def find_missing(scenario: Scenario, effects: Sequence[Effect]) -> Bools:
 
 
 def make_channels(
-    scenario: Scenario, effects: Sequence[Effect], rng: np.random.Generator
+    scenario: Scenario, effects: Sequence[HiddenEffect], rng: np.random.Generator
 ) -> dict[str, tuple[Floats, float]]:
     """Make the channels as their sensors report them: name to values and rate [Hz].
 

@@ -64,7 +64,7 @@ class Scenario:
 
 
 @dataclass(frozen=True)
-class Effect:
+class HiddenEffect:
     """Contribution of one effect to the record, and its ground truth.
 
     The catalogue sets `name`, `driver` and `strength`. `mean` (axis, time) [deg/h] is added;

@@ -21,7 +21,7 @@ from gyrostab.blindtest.generator.detection_limits import (
 )
 from gyrostab.blindtest.generator.environment import lag
 from gyrostab.blindtest.generator.noise import white_level
-from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, to_samples
+from gyrostab.blindtest.generator.scenario import AXES, HiddenEffect, Scenario, to_samples
 
 _MIN_LAG_S, _LAG_COUNT = 1.0, 24
 
@@ -48,7 +48,7 @@ def scale_by_axis(shares: Floats, value: float) -> dict[str, float]:
     }
 
 
-def signed_peaks(effect: Effect, shares: Floats) -> dict[str, float]:
+def signed_peaks(effect: HiddenEffect, shares: Floats) -> dict[str, float]:
     """Find the largest mean of every axis with a nonzero share [deg/h], with the share's sign."""
     assert effect.mean is not None
     return {
@@ -117,13 +117,14 @@ def make_mean_effect(
     regressor: tuple[str, Floats, str] | None = None,
     unless: tuple[str, ...] = (),
     **description: Any,
-) -> Effect:
+) -> HiddenEffect:
     """Make an effect that adds ``shape * shares``, scaled to `strength`.
 
     The shape (time,), or (axis, time), may have any unit; `shares` (axis,) are signed. A
     `regressor` is the name of a parameter, the driver (time,) it multiplies, and its unit; its true
     value on every axis is the least-squares fit to the mean. Where the diagnosis fits one of the
-    nonlinear terms `unless`, that parameter is not comparable. All else are fields of `Effect`.
+    nonlinear terms `unless`, that parameter is not comparable. All else are fields of
+    `HiddenEffect`.
     """
     mean = np.asarray(shares[:, None] * (shape if shape.ndim == 2 else shape[None, :]))
     mean *= strength / mean_size(scenario, mean)
@@ -142,7 +143,7 @@ def make_mean_effect(
         described[regressor[0]] = {"values": values, "unit": regressor[2]} | (
             {"unless": list(unless)} if form_differs and unless else {}
         )
-    return Effect(
+    return HiddenEffect(
         axes=axes_with_share(shares),
         form_differs=form_differs,
         size=strength,
@@ -162,16 +163,16 @@ def make_variance_effect(
     first: float,
     tau: tuple[float, float] | None = None,
     **description: Any,
-) -> tuple[Effect, float]:
+) -> tuple[HiddenEffect, float]:
     """Make an effect on the noise density, and return it with its amplitude.
 
     `ratio` computes the density ratio of `variance_size` from an amplitude, and 1 from amplitude 0;
     the search for the amplitude of `strength` starts at the small one `first`. All else are fields
-    of `Effect`.
+    of `HiddenEffect`.
     """
     amplitude = amplitude_for(lambda a: variance_size(scenario, ratio(a)), strength, first=first)
     final = ratio(amplitude)
-    effect = Effect(
+    effect = HiddenEffect(
         size=variance_size(scenario, final),
         nats=variance_nats(scenario, final, quiescent=description.get("active") is not None),
         tau=tau or (1 / scenario.rate, 30.0),

@@ -9,7 +9,7 @@ import numpy as np
 from gyrostab.arrays import Floats
 from gyrostab.blindtest.generator import instrument
 from gyrostab.blindtest.generator.environment import lag
-from gyrostab.blindtest.generator.scenario import Effect, Scenario, to_samples
+from gyrostab.blindtest.generator.scenario import HiddenEffect, Scenario, to_samples
 from gyrostab.blindtest.generator.shapes import (
     axes_with_share,
     draw_shares,
@@ -19,7 +19,7 @@ from gyrostab.blindtest.generator.shapes import (
 )
 
 
-def shupe(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def shupe(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a Shupe effect: heat conduction through the layers of a quadrupole winding."""
     layers = int(rng.choice([16, 24, 32]))
     weights = instrument.layer_weights(
@@ -44,7 +44,9 @@ def shupe(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> E
     return effect
 
 
-def temperature_bias(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def temperature_bias(
+    scenario: Scenario, rng: np.random.Generator, *, strength: float
+) -> HiddenEffect:
     """Draw a bias that follows the temperature, linearly or nonlinearly."""
     bend = rng.random() < 0.5
     t = scenario.temperature - scenario.temperature.mean()
@@ -72,7 +74,9 @@ def _apply_dead_band(values: Floats, width: float) -> Floats:
     return out
 
 
-def thermal_hysteresis(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def thermal_hysteresis(
+    scenario: Scenario, rng: np.random.Generator, *, strength: float
+) -> HiddenEffect:
     """Draw a temperature hysteresis with one dead band, or several of different widths."""
     many = rng.random() < 0.7
     span = float(np.ptp(scenario.temperature))
@@ -108,7 +112,7 @@ def _since_power_on(scenario: Scenario) -> Floats:
     return since
 
 
-def warm_up(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def warm_up(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a bias that decays after every start: exponential, stretched, or a power of time."""
     kind = rng.choice(["exponential", "stretched", "power"])
     tau = float(np.exp(rng.uniform(np.log(0.015), np.log(0.25)))) * scenario.seconds
@@ -145,7 +149,7 @@ def _make_light_noise(
     strength: float,
     loss: Floats,
     **description: Any,
-) -> Effect:
+) -> HiddenEffect:
     """Make a noise effect from a scalable `loss` of light [dB] by the budget of the detector."""
     shares = np.abs(draw_shares(rng, single_probability=0.4))
     power = 10 ** rng.uniform(-6.0, -4.6)
@@ -162,7 +166,9 @@ def _make_light_noise(
     return effect
 
 
-def temperature_noise(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def temperature_noise(
+    scenario: Scenario, rng: np.random.Generator, *, strength: float
+) -> HiddenEffect:
     """Draw a noise level that follows temperature through the loss of light."""
     t = scenario.temperature
     curved = rng.random() < 0.5
@@ -182,7 +188,7 @@ def temperature_noise(scenario: Scenario, rng: np.random.Generator, *, strength:
     )
 
 
-def ageing_noise(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def ageing_noise(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a noise level that grows with time as light is lost."""
     power = float(rng.choice([0.5, 1.0, 1.5]))
     hours = np.arange(scenario.temperature.size) / 3600.0
@@ -195,7 +201,9 @@ def ageing_noise(scenario: Scenario, rng: np.random.Generator, *, strength: floa
     )
 
 
-def light_power_noise(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def light_power_noise(
+    scenario: Scenario, rng: np.random.Generator, *, strength: float
+) -> HiddenEffect:
     """Draw the noise of a detector under varying light power, which is a channel."""
     loss = -10 * np.log10(lag(scenario.light, rng.uniform(0, 5)))
     form = "shot, thermal and excess noise"

@@ -18,7 +18,7 @@ from gyrostab.blindtest.generator.detection_limits import (
 from gyrostab.blindtest.generator.noise import floor_psd
 from gyrostab.blindtest.generator.scenario import (
     AXES,
-    Effect,
+    HiddenEffect,
     Scenario,
     count_per_second,
     to_samples,
@@ -65,7 +65,7 @@ def _make_random_bias(
     time: float,
     dwell: Floats | None = None,
     **description: Any,
-) -> Effect:
+) -> HiddenEffect:
     """Make a random bias: one of a normal law, or one of two levels with mean times `dwell` [s]."""
     shares = draw_shares(rng)
     rms = amplitude_for(
@@ -81,7 +81,7 @@ def _make_random_bias(
         if dwell is not None:
             cost = course_nats(scenario, rms * shares, waveform, dwell, rng.spawn(1)[0])
             learned = max(learned, learned_nats(scenario, mean) - cost)
-    return Effect(
+    return HiddenEffect(
         axes=axes_with_share(shares),
         size=size,
         nats=nats,
@@ -135,7 +135,7 @@ def _draw_correlation_time(scenario: Scenario, rng: np.random.Generator) -> floa
     return float(np.exp(rng.uniform(np.log(10.0), np.log(max(20.0, 0.05 * scenario.seconds)))))
 
 
-def gauss_markov(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def gauss_markov(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a Gauss-Markov bias, in half of the cases of second order."""
     time, heavy = _draw_correlation_time(scenario, rng), bool(rng.random() < 0.5)
     keep, settle = math.exp(-1 / time), math.ceil(10 * time)
@@ -157,7 +157,7 @@ def gauss_markov(scenario: Scenario, rng: np.random.Generator, *, strength: floa
     )
 
 
-def telegraph(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def telegraph(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a bias that switches between two levels, in half of the cases with gamma dwell times."""
     time, gamma = _draw_correlation_time(scenario, rng), bool(rng.random() < 0.5)
     occupancy = rng.uniform(0.25, 0.75)
@@ -182,7 +182,7 @@ def telegraph(scenario: Scenario, rng: np.random.Generator, *, strength: float) 
     )
 
 
-def ageing_bias(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> Effect:
+def ageing_bias(scenario: Scenario, rng: np.random.Generator, *, strength: float) -> HiddenEffect:
     """Draw a bias that drifts linearly, logarithmically or with a power of time."""
     kind = str(rng.choice(["line", "logarithm", "power"]))
     t = np.arange(scenario.temperature.size, dtype=float)

@@ -114,14 +114,16 @@ def write_outcome(
     }
     targets = [folder / name for name in ("scores.csv", "table.md", *figures)]
     write_text(targets[0], pd.DataFrame(plain).to_csv(index=False))
-    write_text(targets[1], page_text(rows, table, job=job, commitment=commitment, failed=failed))
+    write_text(
+        targets[1], format_outcome(rows, table, job=job, commitment=commitment, failed=failed)
+    )
     for target, figure in zip(targets[2:], figures.values(), strict=True):
         with replace_file(target) as temporary:
             save_png(figure, temporary, colours=64)
     return targets
 
 
-def page_text(
+def format_outcome(
     rows: Sequence[Mapping[str, Any]],
     table: pd.DataFrame,
     *,

@@ -18,7 +18,13 @@ from gyrostab.blindtest.generator import environment, telemetry
 from gyrostab.blindtest.generator.catalogue import CATALOGUE, OUT_OF_CATALOGUE, Entry
 from gyrostab.blindtest.generator.detection_limits import fitted_nats
 from gyrostab.blindtest.generator.record import find_missing, make_channels, make_log, make_record
-from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario, draw_scenario, stream
+from gyrostab.blindtest.generator.scenario import (
+    AXES,
+    HiddenEffect,
+    Scenario,
+    draw_scenario,
+    stream,
+)
 from gyrostab.blindtest.scenarios.plan import STRENGTHS
 from gyrostab.blindtest.scoring.baseline_detectors import find_visibility
 from gyrostab.errors import FormatError, OptionError
@@ -228,7 +234,7 @@ def _block_means(scenario: Scenario, values: Floats) -> list[float]:
     return [float(f"{value:.6g}") for value in np.nanmean(padded, axis=1)]
 
 
-def _describe_effect(scenario: Scenario, effect: Effect) -> dict[str, Any]:
+def _describe_effect(scenario: Scenario, effect: HiddenEffect) -> dict[str, Any]:
     waveform = {}
     if effect.mean is not None:
         waveform = {
@@ -255,7 +261,7 @@ def _describe_effect(scenario: Scenario, effect: Effect) -> dict[str, Any]:
     }
 
 
-def describe_truth(scenario: Scenario, effects: Sequence[Effect]) -> dict[str, Any]:
+def describe_truth(scenario: Scenario, effects: Sequence[HiddenEffect]) -> dict[str, Any]:
     """Describe the ground truth of a case, ready for JSON."""
     return {
         "schema": "gyrostab.blindtest/2",

@@ -19,7 +19,7 @@ from gyrostab.blindtest.generator.noise import BANDS, MeasuredNoise, measure_noi
 from gyrostab.blindtest.generator.record import add_channels, make_channels, make_gap_variables
 from gyrostab.blindtest.generator.scenario import (
     AXES,
-    Effect,
+    HiddenEffect,
     Scenario,
     draw_scenario,
     stream,
@@ -137,7 +137,7 @@ def _draw_around_log(
     )
 
 
-def _compute_addition(scenario: Scenario, effect: Effect, rng: np.random.Generator) -> Floats:
+def _compute_addition(scenario: Scenario, effect: HiddenEffect, rng: np.random.Generator) -> Floats:
     """Compute what an effect adds (3, time); noise cannot be removed from a real record."""
     total = np.zeros((3, scenario.size))
     for part in (effect.mean, effect.extra):
@@ -273,7 +273,7 @@ def _rename_axes(truth: dict[str, Any], names: Mapping[str, str]) -> dict[str, A
 
 def _draw_effect(
     log: xr.Dataset, record: Floats, effect: str, strength: float, rng: np.random.Generator
-) -> tuple[Scenario, Effect]:
+) -> tuple[Scenario, HiddenEffect]:
     entry = CATALOGUE[effect]
     present = set("xyz"[: record.shape[0]])
     measured = measure_noise(record, rate=float(log.attrs["sampling_rate_hz"]), axes=3)

@@ -16,7 +16,7 @@ from scipy import special
 from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.blindtest.generator import noise as floor
 from gyrostab.blindtest.generator.noise import white_level
-from gyrostab.blindtest.generator.scenario import AXES, Effect, Scenario
+from gyrostab.blindtest.generator.scenario import AXES, HiddenEffect, Scenario
 
 #: Level of both detectors.
 LEVEL = 0.01
@@ -271,7 +271,7 @@ def _correlation_p(x: Floats, y: Floats) -> float:
     return float(special.erfc(abs(math.atanh(min(abs(r), 1 - 1e-12))) * math.sqrt((n - 3) / 2)))
 
 
-def trace_visibility(scenario: Scenario, effect: Effect) -> dict[str, float]:
+def trace_visibility(scenario: Scenario, effect: HiddenEffect) -> dict[str, float]:
     """Compute the separation d' of samples and of 1 s means with and without an effect.
 
     For a mean, d' is its rms over the standard deviation of the noise; for a noise effect, the
@@ -302,7 +302,7 @@ def trace_visibility(scenario: Scenario, effect: Effect) -> dict[str, float]:
 
 
 def find_visibility(
-    scenario: Scenario, effects: Sequence[Effect], record: Floats, *, rng: np.random.Generator
+    scenario: Scenario, effects: Sequence[HiddenEffect], record: Floats, *, rng: np.random.Generator
 ) -> dict[str, Any]:
     """Test whether the effects of a record (axis, time) are sub-threshold.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from gyrostab.cli.console import Output, app, show_stages
-from gyrostab.cli.options import Common, Fitting, Reading, Windows
+from gyrostab.cli.options import Common, Fitting, Reading, Windowing
 from gyrostab.store.remote import find_url
 from gyrostab.wording import list_some
 
@@ -72,7 +72,7 @@ def fleet(
     per: Literal["folder", "file"] = "folder",
     tool: Annotated[str | None, Parameter(metavar="REGEX")] = None,
     reports: bool = True,
-    windows: Windows = Windows(),
+    windows: Windowing = Windowing(),
     fitting: Fitting = Fitting(),
     reading: Reading = Reading(),
     scheduler: Scheduler = "processes",

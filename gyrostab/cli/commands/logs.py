@@ -31,7 +31,7 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
     logs
         One or more logs, in any supported format.
     """
-    from gyrostab.ingest.scan import add_channels, scan_and_inspect
+    from gyrostab.ingest.scan import add_channel_files, scan_and_inspect
     from gyrostab.ingest.scan_output import next_command, print_inspection, print_next, print_scan
 
     options = reading.given()
@@ -42,13 +42,13 @@ def scan(logs: Logs, /, *, reading: Reading = Reading(), common: Common = Common
         print_scan(table)
     readable = table[table["rate_hz"].notna()]
     if len(readable):
-        complete = add_channels(options, examined.inspected)
+        complete = add_channel_files(options, examined.inspected)
         print_next(next_command(list(readable["file"]), complete), apart=True)
         _print_suggestions(readable, examined.white_noise)
     for inspection in examined.inspected:
         print_inspection(inspection, [str(error) for error in examined.errors])
         if inspection.row is not None:
-            complete = add_channels(inspection.options, examined.inspected)
+            complete = add_channel_files(inspection.options, examined.inspected)
             print_next(next_command(inspection.paths, complete))
     if examined.errors and (options or len(lost) == len(table)):
         raise examined.errors[0]
@@ -101,7 +101,7 @@ def ingest(
         10 000 000 samples).
     """
     from gyrostab.io.datasets import to_netcdf, to_zarr
-    from gyrostab.jobs.run import count_samples, load_log
+    from gyrostab.jobs.run import count_axis_samples, load_log
     from gyrostab.progress import follow_share
     from gyrostab.store.output import check_output
 
@@ -114,7 +114,7 @@ def ingest(
     with show_stages(common) as stage:
         stage("reading", 0)
         log = load_log(logs, **reading.options())
-        tell = follow_share(stage, "writing", count_samples(log))
+        tell = follow_share(stage, "writing", count_axis_samples(log))
         write = to_zarr if zarr else partial(to_netcdf, compression=compression)
         write(log, target, overwrite=common.overwrite, stamps=stamps, progress=tell)
     print(target)

@@ -52,7 +52,7 @@ def simulate(
         10 000 000 samples).
     """
     from gyrostab.io.datasets import to_netcdf, to_zarr
-    from gyrostab.jobs.run import count_samples, load_log
+    from gyrostab.jobs.run import count_axis_samples, load_log
     from gyrostab.progress import follow_share
     from gyrostab.simulate import simulate as make
     from gyrostab.store.output import check_output
@@ -71,7 +71,7 @@ def simulate(
                     "--like; give that recording too, or leave them out"
                 )
             log = make(model, duration=duration, rate=reading.rate, start=reading.start, seed=seed)
-        tell = follow_share(stage, "simulating", count_samples(log))
+        tell = follow_share(stage, "simulating", count_axis_samples(log))
         write = to_zarr if target.suffix.lower() == ".zarr" else to_netcdf
         write(log, target, overwrite=common.overwrite, stamps=stamps, progress=tell)
     print(target)

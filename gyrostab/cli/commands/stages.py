@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from gyrostab.cli.console import Logs, Output, app, show_stages
-from gyrostab.cli.options import Common, Fitting, Flag, Reading, Running, Windows
+from gyrostab.cli.options import Common, Fitting, Flag, Reading, Running, Windowing
 
 
 @app.command(sort_key=0, help_epilogue="")
@@ -41,7 +41,7 @@ def run(
     /,
     *,
     output: Output,
-    windows: Windows = Windows(),
+    windows: Windowing = Windowing(),
     fitting: Fitting = Fitting(),
     reading: Reading = Reading(),
     running: Running = Running(),
@@ -90,7 +90,7 @@ def davar(
     /,
     *,
     output: Output,
-    windows: Windows = Windows(),
+    windows: Windowing = Windowing(),
     reading: Reading = Reading(),
     running: Running = Running(),
     common: Common = Common(),
@@ -174,7 +174,7 @@ def _print_product(target: Path) -> None:
 def _run_job(
     logs: list[Path],
     output: Path,
-    windows: Windows,
+    windows: Windowing,
     reading: Reading,
     running: Running,
     common: Common,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from gyrostab.cli.console import Output, app
-from gyrostab.cli.options import Common, Fitting, Reading, Windows, whole_number
+from gyrostab.cli.options import Common, Fitting, Reading, Windowing, whole_number
 
 if TYPE_CHECKING:
     from gyrostab.jobs.alarms import Alarm
@@ -26,7 +26,7 @@ def watch(
     lateness: Annotated[str | None, Parameter(metavar="DURATION")] = None,
     idle: Annotated[str | None, Parameter(metavar="DURATION")] = None,
     serve: Annotated[int | None, whole_number(0, "PORT")] = None,
-    windows: Windows = Windows(),
+    windows: Windowing = Windowing(),
     fitting: Fitting = Fitting(),
     reading: Reading = Reading(),
     common: Common = Common(),

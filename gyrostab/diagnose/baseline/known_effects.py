@@ -22,7 +22,7 @@ from gyrostab.diagnose.baseline.known_lines import (
     expect_lines,
     independent_line_share,
     line_factors,
-    resonance_density,
+    predict_resonance,
 )
 from gyrostab.diagnose.predict.filter_response import band_response
 from gyrostab.diagnose.predict.linear_model import (
@@ -177,7 +177,7 @@ def _added_powers(
     for name, values in prediction.spectrum.items():
         factor, density = np.zeros(shape[0], np.complex128), np.zeros(shape)
         factor[rows] = complex_factors(effect, name, axes)
-        peak = resonance_density(effect, name, blocks, axes)
+        peak = predict_resonance(effect, name, blocks, axes)
         density[rows] = (
             values.reshape(*values.shape[:-1], shape[2], -1).mean(axis=-1)
             if peak is None

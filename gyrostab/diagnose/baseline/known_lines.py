@@ -60,7 +60,7 @@ def expect_lines(
             size = square * values.mean(axis=-2)
             places = 0 if prediction.line is None else prediction.line.size // blocks.sizes["block"]
             is_line = np.count_nonzero(values, axis=-1).max() <= places
-            peak = resonance_density(effect, name, blocks, chosen)
+            peak = predict_resonance(effect, name, blocks, chosen)
             if peak is not None:
                 broad[rows] += square * peak * passed[rows]
                 continue
@@ -81,7 +81,7 @@ def expect_lines(
     }
 
 
-def resonance_density(
+def predict_resonance(
     effect: Effect, name: str, blocks: xr.Dataset, axes: tuple[str, ...]
 ) -> Floats | None:
     """Return the tapered density of a resonance per squared unit, (line,); None without resonance.

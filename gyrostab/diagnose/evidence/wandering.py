@@ -86,7 +86,7 @@ def with_process(
     )
 
 
-def allan_variance(tau: float, time: Floats) -> Floats:
+def process_allan_variance(tau: float, time: Floats) -> Floats:
     """Return the Allan variance at `tau` [s] of unit processes with correlation `time` [s].
 
     It is the variance of a mean over `tau` less the covariance of two adjacent means. IEEE Std
@@ -94,7 +94,7 @@ def allan_variance(tau: float, time: Floats) -> Floats:
 
     Examples
     --------
-    >>> allan_variance(1.0, np.array([1e-3, 0.5, 1e3])).round(4)
+    >>> process_allan_variance(1.0, np.array([1e-3, 0.5, 1e3])).round(4)
     array([0.002 , 0.3808, 0.0007])
     """
     ratio = tau / time

@@ -16,7 +16,11 @@ from gyrostab.diagnose.reduce.accumulate import (
     Accumulator,
 )
 from gyrostab.diagnose.reduce.log_blocks import channel_means, is_rms_channel, numeric_channels
-from gyrostab.diagnose.reduce.outliers import count_outliers, quantization_step, zeros_beyond_chance
+from gyrostab.diagnose.reduce.outliers import (
+    count_histogram_outliers,
+    quantization_step,
+    zeros_beyond_chance,
+)
 from gyrostab.diagnose.reduce.rotation_orders import HARMONICS
 from gyrostab.diagnose.reduce.schema import COORDINATES, label_variables, weighted_mean
 from gyrostab.diagnose.reduce.zero_bin import BINS, bin_widths, empty_zone, sticking_value
@@ -94,7 +98,7 @@ def _count_anomalous_samples(work: Accumulator, by_name: Mapping[str, Array]) ->
     axis_rows = slice(0, work.axis_count)
     counts, moments = by_name["counts"][axis_rows], by_name["moments"][axis_rows]
     zeros = counts[..., ZEROS]
-    outlier_count, outliers = count_outliers(by_name["histogram"], work.peaks)
+    outlier_count, outliers = count_histogram_outliers(by_name["histogram"], work.peaks)
     subset, at_once = np.array(list(work.at_once), np.bool_), np.stack(list(work.at_once.values()))
     filled = zeros_beyond_chance(
         by_name["common_zeros"], zeros, counts[..., PRESENT], subset, at_once

@@ -68,7 +68,7 @@ def outlier_limit(samples: float) -> float:
     )
 
 
-def count_outliers(
+def count_histogram_outliers(
     histogram: NDArray[np.uint32], peaks: Sequence[Sequence[Peaks]]
 ) -> tuple[Ints, Ints]:
     """Return the number of outliers, and their number with those beyond twice the limit thrice.
@@ -91,7 +91,8 @@ def count_outliers(
     >>> x[7, 100] += 30.0
     >>> x[9, 100] += 7.0
     >>> histogram = np.zeros((1, 50, HISTOGRAM), np.uint32)
-    >>> outlier_count, outliers = count_outliers(histogram, [[find_peaks(x, histogram[0])]])
+    >>> peaks = [[find_peaks(x, histogram[0])]]
+    >>> outlier_count, outliers = count_histogram_outliers(histogram, peaks)
     >>> outlier_count[0, [7, 9]], outliers[0, [7, 9]], int(outlier_count.sum())
     (array([1, 1]), array([3, 1]), 2)
     """

@@ -13,7 +13,7 @@ from gyrostab.arrays import Array, Bools, Complexes, Floats, Ints
 from gyrostab.diagnose.reduce.log_blocks import finite_range, numeric_channels
 from gyrostab.errors import UnitError
 from gyrostab.physics.phase import turns_of_samples
-from gyrostab.simulate.drivers import Source, make_source
+from gyrostab.simulate.drivers import DriverChannel, make_source
 from gyrostab.time.grid import first_stamp, grid_times
 from gyrostab.units import INNER, parse_unit
 
@@ -32,7 +32,9 @@ _MIN_TURNS_APART = 0.9  # turns per block from a line that was removed; just bel
 class RotationOrders:
     """Demodulation of the axes at multiples of the tool rotation, in order of time."""
 
-    def __init__(self, log: xr.Dataset, source: Source, factor: float, length: int, rate: float):
+    def __init__(
+        self, log: xr.Dataset, source: DriverChannel, factor: float, length: int, rate: float
+    ):
         self.source, self.factor = source, factor  # rotation rate, and its factor to degree s-1
         self.start, self.rate, self.length = first_stamp(log), rate, length
         self.carry: float | None = None

@@ -150,14 +150,14 @@ def to_json_types(value: Any) -> Any:
     return value
 
 
-def effect_table(effect: Effect) -> dict[str, Any]:
+def tabulate_effect(effect: Effect) -> dict[str, Any]:
     """Return an effect as its table in a model, with the parameters that differ from defaults.
 
     Examples
     --------
     >>> from gyrostab.physics.registry import make_effect
     >>> shupe = {"name": "shupe", "axes": ["x"], "sensitivity": 0.4, "lag": 180.0}
-    >>> effect_table(make_effect(shupe))
+    >>> tabulate_effect(make_effect(shupe))
     {'name': 'shupe', 'axes': ['x'], 'sensitivity': 0.4, 'lag': 180.0}
     """
     table: dict[str, Any] = {"name": effect.name}

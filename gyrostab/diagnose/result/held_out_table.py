@@ -217,7 +217,7 @@ def held_out(
         ``coverage95_before``, ``coverage95_after``, the share of them inside the 95 % band;
         ``forecast_gain`` [nats] on the last 30 % of models fitted to the first 70 %.
     """
-    windows = cut_stretches(blocks)
+    windows = cut_held_out_stretches(blocks)
     fold_of_window = np.arange(windows.first.size) % FOLDS
     stretches = np.repeat(fold_of_window, windows.length)
     nats_by_length: list[Floats] = []
@@ -277,7 +277,7 @@ def _compare_models(
     return np.array([nats, variance])
 
 
-def cut_stretches(blocks: xr.Dataset) -> BlockWindows:
+def cut_held_out_stretches(blocks: xr.Dataset) -> BlockWindows:
     """Cut a record into the stretches to hold out: 100 s long, shorter in records below an hour."""
     block_count = blocks.sizes["block"]
     span = block_count * float(blocks.attrs["block_s"])

@@ -24,7 +24,7 @@ from gyrostab.diagnose.predict.candidates import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.predict.windows import channel_units, make_windows
 from gyrostab.diagnose.reduce.schema import format_time, read_as_measured
 from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
-from gyrostab.diagnose.result.diagnosis import effect_table
+from gyrostab.diagnose.result.diagnosis import tabulate_effect
 from gyrostab.diagnose.result.families import find_families
 from gyrostab.diagnose.result.text import (
     chance,
@@ -235,7 +235,7 @@ def model_tables(
         "noise": {**flicker, **noise},
         "bias": {axis: float(f"{rate:.6g}") for axis, rate in rates.items()},
         "delay": dict(blocks.attrs["channel_delays"]),
-        "effect": [effect_table(effect) for effect in [*given_effects, *added_effects]],
+        "effect": [tabulate_effect(effect) for effect in [*given_effects, *added_effects]],
     }
     components = [component for effect_fit in fitted for component in effect_fit.components]
     with_power = {  # whose noise was calibrated together with the sizes of effects

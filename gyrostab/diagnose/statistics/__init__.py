@@ -19,8 +19,8 @@ from gyrostab.diagnose.statistics.random_process import RandomProcess
 from gyrostab.diagnose.statistics.restart import Restart
 from gyrostab.diagnose.statistics.rotation_order import RotationOrder
 from gyrostab.diagnose.statistics.sample_counts import SampleCounts
-from gyrostab.diagnose.statistics.spectral_line import SpectralLine
-from gyrostab.diagnose.statistics.telegraph import Telegraph
+from gyrostab.diagnose.statistics.spectral_line import SpectralLineStatistic
+from gyrostab.diagnose.statistics.telegraph import TelegraphStatistic
 from gyrostab.diagnose.statistics.transfer import Transfer
 from gyrostab.diagnose.statistics.variance_fluctuation import VarianceFluctuation
 from gyrostab.diagnose.statistics.wandering_bias import WanderingBias
@@ -36,10 +36,10 @@ STATISTICS: tuple[Statistic, ...] = (
     Transfer(),
     RotationOrder(),
     RampPhase(),
-    SpectralLine(),
+    SpectralLineStatistic(),
     RandomProcess(),
     WanderingBias(),
-    Telegraph(),
+    TelegraphStatistic(),
     CommonMode(),
     Restart(),
     VarianceFluctuation(),

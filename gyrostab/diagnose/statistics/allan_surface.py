@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Floats
-from gyrostab.diagnose.evidence.wandering import allan_variance, expected_processes
+from gyrostab.diagnose.evidence.wandering import expected_processes, process_allan_variance
 from gyrostab.diagnose.statistics.scores import (
     BlockWindows,
     cumulative,
@@ -188,7 +188,7 @@ def _slow_allan_variance(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -
     processes = (expected_processes(baseline, row) for row in range(blocks.sizes["axis"]))
     total = np.array(
         [
-            part.square @ allan_variance(tau, part.time) + 3.0 * part.angle / tau**2
+            part.square @ process_allan_variance(tau, part.time) + 3.0 * part.angle / tau**2
             for part in processes
         ]
     )

@@ -35,7 +35,7 @@ from gyrostab.diagnose.predict.linear_model import (
 from gyrostab.diagnose.reduce.schema import pair_indices
 from gyrostab.diagnose.statistics.base import SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.mismatch_wording import capitalise_axes, taus_text
-from gyrostab.diagnose.statistics.power import with_axis
+from gyrostab.diagnose.statistics.power import put_axis_first
 from gyrostab.diagnose.statistics.scores import (
     BlockWindows,
     cube_root_score,
@@ -128,7 +128,7 @@ class CrossSpectrum(Statistic):
         if not prediction.coherent or prediction.line is not None:
             return
         for name, density in prediction.spectrum.items():
-            yield Variant(prospect.values, (name,), with_axis(density)[None], squared=True)
+            yield Variant(prospect.values, (name,), put_axis_first(density)[None], squared=True)
 
     def rows(self, candidate: Candidate, state: State) -> list[tuple[str, ...]]:
         return pair_rows(state.blocks)

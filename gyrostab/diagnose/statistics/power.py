@@ -120,7 +120,7 @@ class Power(Statistic):
         spectrum = {}
         if prospect.prediction.line is None:
             spectrum = {
-                name: with_axis(density)
+                name: put_axis_first(density)
                 for name, density in prospect.prediction.spectrum.items()
                 if (_changes_over_time(density) or not prospect.prediction.coherent)
                 and not is_correlated_bias(name, prospect.prediction, prospect.blocks)
@@ -210,19 +210,19 @@ def _filter_change(
     return total * (response - 1.0)
 
 
-def with_axis(density: Floats) -> Floats:
+def put_axis_first(density: Floats) -> Floats:
     """Return a density with the axis first."""
     return np.asarray(density if np.ndim(density) == 3 else np.asarray(density)[None])
 
 
 def _changes_over_time(density: Floats) -> bool:
-    rows = with_axis(density)
+    rows = put_axis_first(density)
     return bool(np.abs(rows - rows[:, :1]).max(initial=0.0) > 1e-6 * np.abs(rows).max(initial=0.0))
 
 
 def _is_white_and_constant(density: Floats) -> bool:
     """Return whether a density is white and constant: a change of N, which is free."""
-    rows = with_axis(density)
+    rows = put_axis_first(density)
     return bool((np.ptp(rows, axis=(1, 2)) <= 1e-6 * np.abs(rows).max(axis=(1, 2))).all())
 
 

@@ -56,7 +56,7 @@ _MAX_COHERENCE_BLOCKS = 3.0  # longest coherence time that the scatter of block 
 _AROUND_LINES = 40  # lines on either side that define the level; design choice
 
 
-class SpectralLine(Statistic):
+class SpectralLineStatistic(Statistic):
     """Spectral lines that exceed the spectrum around them."""
 
     name = "spectral_line"

@@ -43,7 +43,7 @@ _MAX_NULL_BLOCKS = 20_000  # of null records that are searched for two levels; l
 _JUMP_CHANGES = 2  # from block to block, in the column of a jump within a block
 
 
-class Telegraph(BlockMeanStatistic):
+class TelegraphStatistic(BlockMeanStatistic):
     """A bias that switches between two levels, in block means or within blocks."""
 
     name = "telegraph"

@@ -92,10 +92,10 @@ def read_columns(plan: Plan, rows: int, fetch: Fetch, *, notes: Sequence[str] = 
     def take(span: tuple[int, int]) -> dict[int, Any]:
         return {column.source: fetch(column.source, *span) for column in plan.columns}
 
-    return read_batches(plan, spans, take, notes=notes)
+    return read_column_batches(plan, spans, take, notes=notes)
 
 
-def read_batches(
+def read_column_batches(
     plan: Plan,
     batches: Iterable[Batch],
     take: Callable[[Batch], dict[int, Any]],

@@ -13,7 +13,7 @@ import xarray as xr
 
 from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.errors import TimeError, UnitError
-from gyrostab.ingest.concat.grid import PlacedLog, Source, group_axes, merge_gaps, source_of
+from gyrostab.ingest.concat.grid import PlacedLog, SourceLog, group_axes, merge_gaps, source_of
 from gyrostab.ingest.concat.lazy import PlacedArray, chunk_of, place_on_grid
 from gyrostab.ingest.concat.place import place_logs
 from gyrostab.ingest.gap_table import make_dataset, name_lost
@@ -170,7 +170,7 @@ def check_kinds(kinds: Iterable[tuple[str, str | None]]) -> None:
             )
 
 
-def _check_rates(sources: Sequence[Source]) -> None:
+def _check_rates(sources: Sequence[SourceLog]) -> None:
     """Refuse logs whose sampling rate differs from that of the first."""
     first = sources[0]
     for source in sources[1:]:
@@ -182,7 +182,7 @@ def _check_rates(sources: Sequence[Source]) -> None:
             )
 
 
-def _describe_absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str]:
+def _describe_absent(sources: Sequence[SourceLog], axes: Sequence[str]) -> list[str]:
     """Return notes on axes and channels that some logs lack, unless those hold other axes."""
     groups = group_axes(sources, [source.axes for source in sources])
     holders = {f"axis {axis}": [s for s in sources if axis in s.axes] for axis in axes}
@@ -191,7 +191,7 @@ def _describe_absent(sources: Sequence[Source], axes: Sequence[str]) -> list[str
     return absence_notes({name: _logs_without(groups, logs) for name, logs in holders.items()})
 
 
-def _logs_without(groups: Sequence[Sequence[Source]], holders: Sequence[Source]) -> list[str]:
+def _logs_without(groups: Sequence[Sequence[SourceLog]], holders: Sequence[SourceLog]) -> list[str]:
     """Name the logs that lack something, except logs of other axes at the same time."""
     if not holders:
         return []
@@ -209,7 +209,7 @@ def _logs_without(groups: Sequence[Sequence[Source]], holders: Sequence[Source])
 
 
 def _common_attributes(
-    sources: Sequence[Source], size: int, notes: Sequence[str]
+    sources: Sequence[SourceLog], size: int, notes: Sequence[str]
 ) -> dict[str, Any]:
     first = sources[0].log.attrs
     common = {

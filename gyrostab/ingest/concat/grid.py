@@ -28,7 +28,7 @@ from gyrostab.time.grid import TimeGridIndex, first_stamp, grid_times
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class SourceLog:
     """A regular log: file name, first stamp [ns since 1970], rate [Hz], number of samples."""
 
     name: str
@@ -52,7 +52,7 @@ class Source:
 class PlacedLog:
     """A log placed on the common grid."""
 
-    source: Source
+    source: SourceLog
     #: (n, 3): first sample of the grid, first sample of the log, length; more than one where the
     #: log's rate differs from the grid's.
     runs: Ints
@@ -81,7 +81,7 @@ class PlacedLog:
         return np.asarray(self.runs[which, 0] + samples - self.runs[which, 1])
 
 
-def read_log_slice(source: Source, begin: int, end: int) -> Floats:
+def read_log_slice(source: SourceLog, begin: int, end: int) -> Floats:
     """Read the signal of some samples (axis, sample); NaN beyond the ends of a log."""
     data = source.log.variables[signal_name(source.log)].data
     values = np.full((data.shape[0], end - begin), np.nan)
@@ -91,12 +91,12 @@ def read_log_slice(source: Source, begin: int, end: int) -> Floats:
     return values
 
 
-def source_of(log: xr.Dataset, name: str) -> Source:
+def source_of(log: xr.Dataset, name: str) -> SourceLog:
     """Return a regular log with its first stamp, rate and size."""
     index = log.xindexes.get("time")
     if isinstance(index, TimeGridIndex):
-        return Source(name, log, index.start, index.rate, log.sizes["time"])
-    return Source(
+        return SourceLog(name, log, index.start, index.rate, log.sizes["time"])
+    return SourceLog(
         name, log, first_stamp(log), float(log.attrs["sampling_rate_hz"]), log.sizes["time"]
     )
 

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from gyrostab.arrays import Floats
-from gyrostab.ingest.concat.grid import PlacedLog, Source, read_log_slice, runs_of
+from gyrostab.ingest.concat.grid import PlacedLog, SourceLog, read_log_slice, runs_of
 from gyrostab.ingest.gap_table import (
     CLOCK_STEP,
     RESTART,
     describe_break,
-    format_duration,
     is_restart,
 )
+from gyrostab.time.durations import format_measured_duration
 from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import format_stamp
 from gyrostab.wording import list_some
@@ -38,7 +38,7 @@ MAX_SHIFT_SAMPLES = 64
 _MAX_NAMED = 5  # events of one kind that are listed one by one
 
 
-def _match_logs(held: Source, new: Source, lag: int) -> Match:
+def _match_logs(held: SourceLog, new: SourceLog, lag: int) -> Match:
     """Compare both ends of the overlap by the clock: `new` begins at sample `lag` of `held`."""
     axes = [axis for axis in held.axes if axis in new.axes]
     low, high = max(lag, 0), min(lag + new.size, held.size)
@@ -53,7 +53,9 @@ def _match_logs(held: Source, new: Source, lag: int) -> Match:
     )
 
 
-def place_logs(sources: Sequence[Source], *, max_gap: float) -> tuple[list[PlacedLog], list[str]]:
+def place_logs(
+    sources: Sequence[SourceLog], *, max_gap: float
+) -> tuple[list[PlacedLog], list[str]]:
     """Place logs, in the order of their first stamps, on the grid of the first.
 
     A pause longer than `max_gap` [s] is taken as a step of the clock. The first sample of all is
@@ -96,7 +98,7 @@ def _first_notes(notes: Sequence[str], subject: str) -> list[str]:
 
 
 def _place_next(
-    pieces: list[PlacedLog], source: Source, rate: float, max_gap: float
+    pieces: list[PlacedLog], source: SourceLog, rate: float, max_gap: float
 ) -> tuple[PlacedLog, tuple[PlacedLog, Match] | None]:
     """Place the next log on the grid; also return the log that it overlaps, if any."""
     if not pieces:
@@ -129,7 +131,7 @@ def _place_next(
 
 
 def _place_at(
-    position: float, source: Source, rate: float, clock: tuple[int, int], cause: int = -1
+    position: float, source: SourceLog, rate: float, clock: tuple[int, int], cause: int = -1
 ) -> PlacedLog:
     """Place a log whose first sample lies at a position of the grid of `rate` [Hz]."""
     first = int(np.rint(position))
@@ -153,7 +155,7 @@ def _grid_notes(pieces: Sequence[PlacedLog], rate: float) -> list[str]:
         notes.append(
             f"{names}: begin between two samples of the grid of {pieces[0].source.name}; their "
             "samples were put on the nearest ones, "
-            f"at most {largest:.2g} of a sample ({format_duration(largest / rate)}) away"
+            f"at most {largest:.2g} of a sample ({format_measured_duration(largest / rate)}) away"
         )
     deviating = [piece for piece in pieces if piece.source.rate != rate]
     if deviating:
@@ -180,7 +182,7 @@ def _overlap_note(piece: PlacedLog, held: PlacedLog, match: Match, rate: float) 
     extent = (
         "all of it is"
         if end >= piece.end
-        else f"{format_duration((end - first) / rate)} from {begin} are"
+        else f"{format_measured_duration((end - first) / rate)} from {begin} are"
     )
     differ = (
         f"; {match.common - match.same} of {match.common} compared samples differ"

@@ -20,10 +20,10 @@ from gyrostab.arrays import Ints
 from gyrostab.errors import FormatError, OptionError
 from gyrostab.ingest.formats.layout import (
     Field,
-    Layout,
-    find_layout,
+    RecordLayout,
     find_layout_file,
     find_messages,
+    find_record_layout,
     layout_path,
     unwrap_counter,
 )
@@ -56,7 +56,7 @@ def list_layouts(paths: Iterable[Path]) -> list[Path]:
 
 def _make_tables(path: Path, options: ReadOptions, *, needs_rate: bool) -> TablesOfFile:
     """Return the table of all records; messages are searched in the whole file."""
-    layout = find_layout(path)
+    layout = find_record_layout(path)
     rows, extra_bytes = divmod(path.stat().st_size - layout.header, layout.size)
     starts = None
     if layout.sync and rows > 0:
@@ -100,13 +100,19 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
 
 def _date_first_message(path: Path, options: ReadOptions) -> ReadOptions:
     """Count numbered messages from ``--start``, as their first one is at zero."""
-    if options.epoch is not None or find_layout(path).counter is None:
+    if options.epoch is not None or find_record_layout(path).counter is None:
         return options
     return replace(options, start=None, epoch=options.start)
 
 
 def _count_time(
-    path: Path, layout: Layout, fetch: Any, rows: int, options: ReadOptions, *, needs_rate: bool
+    path: Path,
+    layout: RecordLayout,
+    fetch: Any,
+    rows: int,
+    options: ReadOptions,
+    *,
+    needs_rate: bool,
 ) -> tuple[TableColumn | None, list[str]]:
     """Return the stamps by the counter of the layout, and a note on lost messages."""
     counter = layout.counter
@@ -129,7 +135,7 @@ def _count_time(
 
 
 def _read_field(
-    path: Path, layout: Layout, starts: Ints | None, field: Field, begin: int, stop: int
+    path: Path, layout: RecordLayout, starts: Ints | None, field: Field, begin: int, stop: int
 ) -> Any:
     """Return the values of a field in a range of records, which begin at `starts`, or adjoin."""
     raw = np.memmap(path, dtype=np.uint8, mode="r", offset=layout.header)

@@ -68,7 +68,7 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Layout:
+class RecordLayout:
     """Fields of a record of `size` bytes, in a byte order of numpy; messages have `sync` bytes."""
 
     place: str
@@ -92,7 +92,7 @@ def find_layout_file(path: Path) -> Path | None:
     return next((place for place in places if place.is_file()), None)
 
 
-def find_layout(path: Path) -> Layout:
+def find_record_layout(path: Path) -> RecordLayout:
     """Return the layout of a layout file, or of the sensor whose messages a file holds."""
     place = find_layout_file(path)
     if place is None:
@@ -106,7 +106,7 @@ def find_layout(path: Path) -> Layout:
     return _parse_layout(place.name, content)
 
 
-def _find_known(path: Path, name: str) -> Layout:
+def _find_known(path: Path, name: str) -> RecordLayout:
     with path.open("rb") as file:
         head = np.frombuffer(file.read(_HEAD_BYTES), dtype=np.uint8)
     for layout in _known_layouts():
@@ -120,12 +120,12 @@ def _find_known(path: Path, name: str) -> Layout:
 
 
 @cache
-def _known_layouts() -> list[Layout]:
+def _known_layouts() -> list[RecordLayout]:
     layouts = load_toml_folder("gyrostab.ingest.formats", "layouts")
     return [_parse_layout(name, content) for name, content in layouts.items()]
 
 
-def _parse_layout(place: str, content: Mapping[str, Any]) -> Layout:
+def _parse_layout(place: str, content: Mapping[str, Any]) -> RecordLayout:
     for key in content:
         if key not in _KEYS:
             raise OptionError(
@@ -164,7 +164,9 @@ def _parse_layout(place: str, content: Mapping[str, Any]) -> Layout:
         )
     size += CRC_BYTES if sync else 0
     counter = next(iter(counters), None)
-    return Layout(place, order, header, size, fields, counter, sync, str(content.get("note", "")))
+    return RecordLayout(
+        place, order, header, size, fields, counter, sync, str(content.get("note", ""))
+    )
 
 
 def _parse_field(item: Any, order: str, offset: int) -> Field | None:

@@ -18,7 +18,7 @@ from gyrostab.ingest.columns.plan_roles import plan_columns
 from gyrostab.ingest.columns.typed import (
     batch_rows,
     float32_note,
-    read_batches,
+    read_column_batches,
     summarise_columns,
 )
 from gyrostab.ingest.formats.recognise import make_matcher
@@ -71,7 +71,7 @@ def read(path: Path, options: ReadOptions) -> xr.Dataset:
         arrays = dict(zip(batch.schema.names, batch.columns, strict=True))
         return {c.source: _to_numpy(arrays[names[c.source]]) for c in plan.columns}
 
-    return read_batches(
+    return read_column_batches(
         plan,
         file.iter_batches(batch_size=batch_rows(len(columns)), columns=columns),
         take,

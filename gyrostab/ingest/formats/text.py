@@ -197,7 +197,7 @@ def _open_text(path: Path) -> Iterator[IO[bytes]]:
             ) from error
 
 
-def read_head(path: Path) -> str:
+def read_text_head(path: Path) -> str:
     """Return the first characters of a text file, plain or gzipped; "" for other files."""
     if not path.is_file() or not _holds_text(path):
         return ""

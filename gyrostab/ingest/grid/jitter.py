@@ -279,7 +279,7 @@ def _is_near(off: Floats, sigma: float) -> Bools:
     return np.asarray(np.abs(off) <= 4 * max(sigma, MIN_SIGMA))
 
 
-def count_samples(
+def number_used_rows(
     rows: Ints, stamps: Ints, jitter: JitterModel, longest: float
 ) -> tuple[Ints, Ints, Ints]:
     """Return stamps [ns], sample numbers and piece numbers of the used rows of a block."""
@@ -312,7 +312,9 @@ def fit_pieces(
         values = block[1]
         readable = readable_stamps(values)
         if jitter is not None:
-            readable, count, piece = count_samples(np.arange(len(values)), values, jitter, longest)
+            readable, count, piece = number_used_rows(
+                np.arange(len(values)), values, jitter, longest
+            )
         elif counted:
             piece = np.cumsum(np.abs(np.diff(readable, prepend=readable[:1])) > longest)
             count = np.flatnonzero(values != NO_STAMP)  # rows without a readable stamp count too

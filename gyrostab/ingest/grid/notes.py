@@ -13,7 +13,6 @@ from gyrostab.ingest.gap_table import (
     RESTART,
     describe_break,
     describe_clock_change,
-    format_duration,
 )
 from gyrostab.ingest.grid.jitter import MIN_SIGMA
 from gyrostab.ingest.grid.place import Placement
@@ -21,6 +20,7 @@ from gyrostab.ingest.grid.rate import DeviatingStretch, RateEstimate
 from gyrostab.ingest.grid.scan_pass import ScanPass, file_of, record_name
 from gyrostab.kernels.grid.stamps import DUPLICATE, EVENT_ROW, OUT_OF_ORDER
 from gyrostab.schema import log_channels
+from gyrostab.time.durations import format_measured_duration
 from gyrostab.time.grid import grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
@@ -134,8 +134,8 @@ def _describe_method(where: str, estimate: RateEstimate, placement: Placement) -
     )
     if estimate.places_by_count:
         reach = (
-            f"; stamps and samples differ by up to {format_duration(placement.wander / rate)} in "
-            "the long run"
+            "; stamps and samples differ by up to "
+            f"{format_measured_duration(placement.wander / rate)} in the long run"
             if placement.wander >= 1
             else ""
         )
@@ -151,7 +151,7 @@ def _describe_method(where: str, estimate: RateEstimate, placement: Placement) -
         )
     elif jitter is not None:
         notes.append(
-            f"{where}: the stamps scatter by {format_duration(jitter.sigma / rate)}, "
+            f"{where}: the stamps scatter by {format_measured_duration(jitter.sigma / rate)}, "
             f"{jitter.sigma:.2g} of a sampling interval, "
             f"as times of arrival do: rows keep their order at {rate:.10g} Hz, and a missing "
             f"sample is located to a few rows{_IF_HIGHER * (jitter.sigma > _UNCERTAIN_SIGMA)}"
@@ -245,15 +245,15 @@ def _describe_missing(raw: xr.Dataset, placement: Placement, table: Ints) -> lis
         file, local = file_of(raw, row)
         since = format_stamp(int(grid_times(placement.start, rate, first)))
         notes.append(
-            f"{file}: {format_duration(samples / rate)} without samples from {since} (after row "
-            f"{local}){_describe_local(raw, samples / rate)}"
+            f"{file}: {format_measured_duration(samples / rate)} without samples from {since} "
+            f"(after row {local}){_describe_local(raw, samples / rate)}"
         )
     if len(holes) > len(longest):
         total = int(holes[:, 2].sum())
         share = total / placement.size
         notes.append(
             f"{record_name(raw)}: missing: {_count_of(total, 'sample')} "
-            f"({format_duration(total / rate)}, {100 * share:.2g} % of the log) "
+            f"({format_measured_duration(total / rate)}, {100 * share:.2g} % of the log) "
             f"in {_count_of(len(holes), 'place')}; "
             "all are in the table of gaps"
         )

@@ -13,7 +13,7 @@ import xarray as xr
 from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.errors import TimeError
 from gyrostab.ingest.columns.stamps import read_stamps
-from gyrostab.ingest.gap_table import format_duration, is_restart
+from gyrostab.ingest.gap_table import is_restart
 from gyrostab.ingest.grid.rate import RateEstimate
 from gyrostab.ingest.grid.scan_pass import file_of
 from gyrostab.ingest.grid.starting_period import Stamps, readable_stamps, recut_blocks
@@ -31,6 +31,7 @@ from gyrostab.kernels.grid.stamps import (
     RESTART,
     STEP,
 )
+from gyrostab.time.durations import format_measured_duration
 from gyrostab.time.grid import period_ns
 from gyrostab.time.stamps import format_stamp
 
@@ -127,12 +128,12 @@ def check_grid(
         )
     else:
         fix = (
-            f"other stamps are {format_duration(1.0 / placement.rate)} apart, too close for a log "
-            "of that length: correct them or the unit of time"
+            f"other stamps are {format_measured_duration(1.0 / placement.rate)} apart, too close "
+            "for a log of that length: correct them or the unit of time"
         )
     raise TimeError(
         f"{file_of(raw, rows[0])[0]}: from {places[0]} to {places[1]} there are "
-        f"{format_duration(gap)} without samples, and the grid of "
+        f"{format_measured_duration(gap)} without samples, and the grid of "
         f"{placement.rate:.10g} Hz would have {placement.size:.4g} samples for "
         f"{placement.placed_count:,} rows; {fix}. If the stamps are right: "
         f"{describe_limit('grid_samples', placement.size, limits)}"

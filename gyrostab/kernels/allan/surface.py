@@ -43,7 +43,7 @@ NONE, STRICT, WEIGHTED = 0, 1, 2
 _NATIVE = np.dtype(np.float64), np.dtype(np.float32)
 
 
-class Unit(NamedTuple):
+class WorkUnit(NamedTuple):
     """Options shared by all units of work of one surface.
 
     Attributes
@@ -111,7 +111,7 @@ class _Work(NamedTuple):
     """Samples of a unit of work: windows, runs of present samples, what is taken from each rate."""
 
     x: NDArray[np.generic]
-    unit: Unit
+    unit: WorkUnit
     space: Workspace
     n_windows: int
     starts: Ints
@@ -210,7 +210,7 @@ def convert_to_native(x: NDArray[np.generic]) -> NDArray[np.floating[Any]]:
 
 
 def surface_unit(
-    x: NDArray[np.generic], unit: Unit, space: Workspace | None = None
+    x: NDArray[np.generic], unit: WorkUnit, space: Workspace | None = None
 ) -> tuple[Cells, Floats]:
     """Compute cells and means of the windows in a span of samples of one axis.
 
@@ -219,7 +219,7 @@ def surface_unit(
     x : ndarray (n,)
         Rates, or cumulative angles if ``unit.angle``; NaN marks a missing sample; integer or float
         of any size. Windows start at samples 0, step, 2 step ... and lie inside the span.
-    unit : Unit
+    unit : WorkUnit
         Window, step, averaging factors and rules.
     space : Workspace, optional
         Working memory for consecutive units; the previous result is overwritten.

@@ -32,7 +32,7 @@ WIDE = 100.0
 _SLOW = 1e-2
 
 
-class Reading(NamedTuple):
+class Transition(NamedTuple):
     """Transition of a process from sample to sample, and its output."""
 
     step: Floats  # (d, d): state at the next sample from the state at this one
@@ -105,7 +105,7 @@ def _integrate_moments(a: Floats, b: Floats, c: Floats, rate: float) -> tuple[Fl
 
 def _make_reading(
     a: Floats, b: Floats, covariance: Floats, c: Floats, rate: float, *, average: bool
-) -> Reading:
+) -> Transition:
     """Sample a stationary process with state matrix `a` [s-1] and the output `c` at `rate` [Hz].
 
     `b` is the gain of the white noise, of density 1, that drives the state.
@@ -124,7 +124,7 @@ def _make_reading(
         crossed = once @ covariance @ c - step @ (covariance @ read)
         total[:size, size] = total[size, :size] = crossed
         total[size, size] = c @ twice @ covariance @ c - read @ covariance @ read
-    return Reading(
+    return Transition(
         np.ascontiguousarray(step),
         np.ascontiguousarray(read),
         _factor_covariance(total),
@@ -132,7 +132,9 @@ def _make_reading(
     )
 
 
-def oscillator(frequency: float, quality: float, rate: float, *, average: bool = True) -> Reading:
+def oscillator(
+    frequency: float, quality: float, rate: float, *, average: bool = True
+) -> Transition:
     """Describe the velocity of a damped oscillator driven by white noise, with unit variance.
 
     Parameters
@@ -152,7 +154,7 @@ def oscillator(frequency: float, quality: float, rate: float, *, average: bool =
     return _make_reading(a, b, np.eye(2), c, rate, average=average)
 
 
-def mount(resonance: float, quality: float, rate: float, *, average: bool = True) -> Reading:
+def mount(resonance: float, quality: float, rate: float, *, average: bool = True) -> Transition:
     """Describe white noise of density 1 Hz-1 behind a mass on a spring, whose gain is one at rest.
 
     Parameters
@@ -194,7 +196,7 @@ def band(
     quality: float = 1.0,
     *,
     average: bool = False,
-) -> Reading:
+) -> Transition:
     """Describe noise of unit variance in a band, with an optional mount.
 
     Parameters
@@ -229,12 +231,12 @@ def band(
 class Process(NamedTuple):
     """A process at one sample: its reading, random numbers, and state (d,)."""
 
-    reading: Reading
+    reading: Transition
     rng: np.random.Generator
     position: Floats
 
 
-def begin_process(reading: Reading, rng: np.random.Generator) -> Process:
+def begin_process(reading: Transition, rng: np.random.Generator) -> Process:
     """Draw a state of the stationary process."""
     return Process(reading, rng, reading.spread @ rng.standard_normal(reading.read.size))
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from gyrostab.errors import OptionError, OutputError
 from gyrostab.store.output.content import FindForeign, find_foreign_item, is_store
 from gyrostab.store.output.inputs import match_files, protected_inputs
-from gyrostab.store.remote import find_kind, find_url
+from gyrostab.store.remote import find_remote_kind, find_url
 
 _MAX_LINKS = 40  # limit of Linux (path_resolution(7)); more links are treated as a loop
 
@@ -181,7 +181,7 @@ def _check_address(url: str, *, store: bool) -> None:
             f"output {url!r}: only a Zarr store (.zarr) is written to an address; give another "
             "name with -o, and copy the file there"
         )
-    if find_kind(url, required=False, error=OutputError) in ("store", "file"):
+    if find_remote_kind(url, required=False, error=OutputError) in ("store", "file"):
         raise OutputError(
             f"output {url!r} exists already, and nothing at an address is replaced; remove it "
             "first, or give another name with -o"

@@ -107,7 +107,7 @@ def test_reset_count_follows_the_rate():
 
 def test_dead_zone_holds_at_zero_and_is_odd():
     w = np.linspace(-1, 1, 201)
-    out = instrument.dead_zone(w, width=0.3)
+    out = instrument.apply_dead_zone(w, width=0.3)
     assert (out[np.abs(w) <= 0.3] == 0).all()
     np.testing.assert_allclose(out, -out[::-1], atol=1e-7)
 

@@ -20,8 +20,8 @@ from gyrostab.blindtest.generator.detection_limits import (
 from gyrostab.blindtest.generator.noise import (
     BANDS,
     _fit_slope,
-    line_density,
     measure_noise,
+    smooth_periodogram,
 )
 from gyrostab.blindtest.generator.record import make_log
 from gyrostab.blindtest.generator.scenario import AXES, draw_scenario
@@ -118,7 +118,7 @@ def test_size_of_a_wave_in_coloured_noise_is_its_power_over_the_density(frequenc
 
 def test_line_density_is_right_at_the_lowest_lines():
     steps = np.random.default_rng(2).normal(0, 0.01, (200, 4000))
-    density = np.mean([line_density(np.cumsum(row), rate=1.0)[:4] for row in steps], axis=0)
+    density = np.mean([smooth_periodogram(np.cumsum(row), rate=1.0)[:4] for row in steps], axis=0)
     k = np.arange(1, 5)
     np.testing.assert_allclose(density, 0.01**2 / (2 * math.pi * k / 8000) ** 2, rtol=0.5)
 

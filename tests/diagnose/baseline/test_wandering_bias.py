@@ -10,7 +10,7 @@ import xarray as xr
 
 from gyrostab import diagnose
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
-from gyrostab.diagnose.evidence.wandering import allan_variance
+from gyrostab.diagnose.evidence.wandering import process_allan_variance
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.kernels.spectra.expected import correlated_powers
 from gyrostab.kernels.spectra.periodogram import ordinates, taper
@@ -54,7 +54,7 @@ def test_allan_variance_is_that_of_ieee_std_952():
     tau, time = 3.0, np.array([0.2, 3.0, 50.0])
     ratio = time / tau
     law = ratio * (2.0 - ratio * (3.0 - 4.0 * np.exp(-1.0 / ratio) + np.exp(-2.0 / ratio)))
-    np.testing.assert_allclose(allan_variance(tau, time), law, rtol=1e-9)
+    np.testing.assert_allclose(process_allan_variance(tau, time), law, rtol=1e-9)
 
 
 @pytest.mark.parametrize("effect", [WANDER_30_S, WANDER_300_S], ids=["30 s", "300 s"])

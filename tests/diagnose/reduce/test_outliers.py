@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gyrostab.diagnose.reduce.outliers import (
     EXPECTED_FALSE_OUTLIERS,
-    count_outliers,
+    count_histogram_outliers,
     find_peaks,
     quantization_step,
 )
@@ -22,7 +22,7 @@ def counted(x: np.ndarray, block: int = BLOCK) -> tuple[np.ndarray, np.ndarray]:
     """Return number and weighted number of outliers by block, of one axis."""
     values = np.ascontiguousarray(x[: x.size // block * block].reshape(-1, block))
     histogram = np.zeros((1, len(values), HISTOGRAM), np.uint32)
-    number, outliers = count_outliers(histogram, [[find_peaks(values, histogram[0])]])
+    number, outliers = count_histogram_outliers(histogram, [[find_peaks(values, histogram[0])]])
     return number[0], outliers[0]
 
 

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gyrostab.diagnose.result.content import VERDICTS, check_diagnosis, make_schema
-from gyrostab.diagnose.result.diagnosis import Diagnosis, effect_table, model_text, to_json_types
+from gyrostab.diagnose.result.diagnosis import Diagnosis, model_text, tabulate_effect, to_json_types
 from gyrostab.diagnose.result.record_text import summary
 from gyrostab.diagnose.result.text import (
     chance,
@@ -167,7 +167,7 @@ def test_json_has_null_for_infinities():
 def test_effect_tables_round_trip(name: str):
     kind = effects()[name]
     effect = kind.example(axes=("x", "y"))
-    written = model_text({"noise": {"N": 0.003}, "effect": [effect_table(effect)]})
+    written = model_text({"noise": {"N": 0.003}, "effect": [tabulate_effect(effect)]})
     assert read_model(tomllib.loads(written)).effects == (effect,)
 
 

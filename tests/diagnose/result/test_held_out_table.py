@@ -10,7 +10,7 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.result import held_out_table
-from gyrostab.diagnose.result.held_out_table import cut_stretches, log_likelihood
+from gyrostab.diagnose.result.held_out_table import cut_held_out_stretches, log_likelihood
 from gyrostab.diagnose.result.surfaces import CASES, make_surfaces
 from gyrostab.noise import LAWS
 from gyrostab.simulate import simulate
@@ -262,7 +262,7 @@ def test_allan_variance_is_compared_with_the_shown_model():
 
 def test_stretches_cover_the_record():
     _, blocks = _record()
-    cut = cut_stretches(blocks)
+    cut = cut_held_out_stretches(blocks)
     assert cut.first[0] == 0
     assert cut.stop[-1] == 180
     np.testing.assert_array_equal(cut.stop[:-1], cut.first[1:])

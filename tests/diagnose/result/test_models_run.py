@@ -16,7 +16,7 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.estimate.joint_fit import _make_effect
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.result.diagnosis import effect_table, model_text
+from gyrostab.diagnose.result.diagnosis import model_text, tabulate_effect
 from gyrostab.diagnose.result.tables import baseline_table, model_tables
 from gyrostab.physics.registry import effects
 from gyrostab.simulate import read_model, simulate
@@ -63,7 +63,7 @@ def simulate_sizes(name: str, scale: float, seed: int) -> xr.Dataset | None:
     if effect is None:
         return None
     text = model_text(
-        {"noise": {axis: {"N": 0.003} for axis in "xyz"}, "effect": [effect_table(effect)]}
+        {"noise": {axis: {"N": 0.003} for axis in "xyz"}, "effect": [tabulate_effect(effect)]}
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)

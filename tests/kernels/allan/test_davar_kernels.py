@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from gyrostab.kernels.allan import plain_sums, vectors
 from gyrostab.kernels.allan.integrate import integrate, present_runs
 from gyrostab.kernels.allan.plain_sums import CONSECUTIVE_LAGS, LANES
-from gyrostab.kernels.allan.surface import Unit, surface_unit
+from gyrostab.kernels.allan.surface import WorkUnit, surface_unit
 from gyrostab.kernels.workspace import Workspace
 
 
@@ -82,7 +82,7 @@ class TestKernels:
             (whole, False, 8, 9),
         ]:
             ks = np.arange(1, n_tau + 1) * apart
-            unit = Unit(1000, 300, ks, angle, 0.01, 0.3, 0.1)
+            unit = WorkUnit(1000, 300, ks, angle, 0.01, 0.3, 0.1)
             cells, lines = surface_unit(x, unit)
             used_cells, used_lines = surface_unit(x, unit, space)
             for fresh, used in zip([*cells, lines], [*used_cells, used_lines], strict=True):
@@ -95,7 +95,7 @@ class TestKernels:
         x = np.cumsum(x) if angle else x
         damaged = x.copy()
         damaged[place] = 1e17
-        unit = Unit(100, 100, np.arange(1, 20), angle, 0.01, 0.3, 0.1)
+        unit = WorkUnit(100, 100, np.arange(1, 20), angle, 0.01, 0.3, 0.1)
         (cells, lines), (got_cells, got_lines) = (surface_unit(y, unit) for y in (x, damaged))
         others = slice(0, 8) if place else slice(1, 9)
         np.testing.assert_allclose(got_lines[:3, others], lines[:3, others], rtol=1e-9)
