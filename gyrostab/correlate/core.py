@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -108,14 +108,7 @@ def correlate(
     time = (product["time"].values - product["time"].values[0]) / np.timedelta64(1, "s")
     length, step = _window_lengths(product, time)
     lags = _choose_lags(max_lag, float(time[-1] - time[0]), step)
-    is_list = isinstance(channel, Sequence) and not isinstance(channel, str)
-    channels: list[Any] = list(channel) if is_list else [channel]
-    for item in channels:
-        if not isinstance(item, str | xr.DataArray):
-            raise OptionError(
-                f"channel={item!r} is neither a name nor an xarray.DataArray; a pandas.Series on "
-                "dates becomes one with .to_xarray().assign_attrs(units=...)"
-            )
+    channels = _list_channels(channel)
     drivers = align_drivers(product, channels, lags, step)
     check_names(drivers)
     other_series = [product[name].values for name in other_channels(product, drivers)]
@@ -139,11 +132,7 @@ def correlate(
         for d, driver in enumerate(drivers):
             used = replace(driver, values=driver.values[: counts[d]])
             lag_times = lags[: counts[d]].astype(np.float64) * step
-            groups: dict[tuple[bytes, bytes], list[tuple[int, int]]] = {}
-            for place, row in series.items():
-                mask = np.isfinite(row) & known[d]
-                groups.setdefault((mask.tobytes(), coverage[place[0]].tobytes()), []).append(place)
-            for key, places in groups.items():
+            for key, places in _group_series(series, known[d], coverage).items():
                 rows = np.stack([series[place] for place in places])
                 fitted = fit_driver(find_blocks(*key), rows, used, other_series, lag_times, level)
                 entries |= {(*place, d): entry for place, entry in zip(places, fitted, strict=True)}
@@ -155,6 +144,42 @@ def correlate(
             blocks = find_blocks((np.isfinite(row) & shared).tobytes(), coverage[a].tobytes())
             fit_partial_effects(blocks, row, drivers, of_series, level)
     _adjust_p_values(entries)
+    _judge_entries(entries, product, names, drivers)
+    longest = float(lags[counts.max() - 1] * step)
+    return make_coupling_dataset(product, names, drivers, entries, level=level, longest=longest)
+
+
+def _list_channels(channel: Any) -> list[str | xr.DataArray]:
+    """Return the channels to correlate with; raise `OptionError` for other objects."""
+    is_list = isinstance(channel, Sequence) and not isinstance(channel, str)
+    channels: list[Any] = list(channel) if is_list else [channel]
+    for item in channels:
+        if not isinstance(item, str | xr.DataArray):
+            raise OptionError(
+                f"channel={item!r} is neither a name nor an xarray.DataArray; a pandas.Series on "
+                "dates becomes one with .to_xarray().assign_attrs(units=...)"
+            )
+    return channels
+
+
+def _group_series(
+    series: Mapping[tuple[int, int], Floats], known: Bools, coverage: Floats
+) -> dict[tuple[bytes, bytes], list[tuple[int, int]]]:
+    """Group the places of series by the windows that they can use, and by their coverage."""
+    groups: dict[tuple[bytes, bytes], list[tuple[int, int]]] = {}
+    for place, row in series.items():
+        mask = np.isfinite(row) & known
+        groups.setdefault((mask.tobytes(), coverage[place[0]].tobytes()), []).append(place)
+    return groups
+
+
+def _judge_entries(
+    entries: Mapping[tuple[int, int, int], dict[str, Any]],
+    product: xr.Dataset,
+    names: list[str],
+    drivers: list[Driver],
+) -> None:
+    """Add verdict, unit and statement to each entry."""
     is_pair = [driver.name for driver in drivers[1:]] == [f"{drivers[0].name}_rate"]
     for (a, v, d), entry in entries.items():
         twin = entries[a, v, 1 - d] if is_pair else None
@@ -162,8 +187,6 @@ def correlate(
         entry["unit_label"] = slope_label(product[names[v]], drivers[d].units)
         series_name = f"{names[v].replace('_', ' ')} of axis {product['axis'].values[a]}"
         entry["statement"] = describe_coupling(entry, drivers[d].label, series_name)
-    longest = float(lags[counts.max() - 1] * step)
-    return make_coupling_dataset(product, names, drivers, entries, level=level, longest=longest)
 
 
 def _check_windows(product: xr.Dataset) -> None:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from gyrostab.arrays import Array
 from gyrostab.correlate.drivers import Driver, slope_units
 from gyrostab.correlate.judge import LIMITS, VERDICTS, slope_label
 from gyrostab.errors import OptionError
 from gyrostab.noise import TERMS
 from gyrostab.schema import flag_attributes
 
+_PLACE = ("axis", "variable", "driver")
 # Key of the entry, long name and units of each variable.
 _STATISTICS = {
     "coupling_lag": ("lag", "time by which the variable follows the driver", "s"),
@@ -77,63 +80,22 @@ def make_coupling_dataset(
     longest: float,
 ) -> xr.Dataset:
     """Build the dataset of entries by (axis, variable, driver), with the series they describe."""
-    shape = (product.sizes["axis"], len(names), len(drivers))
-    dims = ("axis", "variable", "driver")
-
-    ordered = [entries[place] for place in np.ndindex(shape)]
-
-    def table(key: str, dtype: Any = np.float64) -> Any:
-        return np.array([entry[key] for entry in ordered], dtype).reshape(shape)
-
+    table = np.empty((product.sizes["axis"], len(names), len(drivers)), dtype=object)
+    for place, entry in entries.items():
+        table[place] = entry
     copied = [*names, *(["observable"] if set(names) & set(TERMS) else [])]
     result = (
         product[copied].drop_attrs(deep=False).assign_coords(time_bounds=product["time_bounds"])
     )
-    made: dict[str, Any] = {}
-    for driver in drivers:
-        attributes = {"long_name": f"{driver.label}, mean of the window", "units": driver.units}
-        made[driver.name] = (
-            product[driver.name] if driver.of_product else ("time", driver.values[0], attributes)
-        )
-    for name, (key, label, units) in _STATISTICS.items():
-        made[name] = (dims, table(key), {"long_name": label, "units": units})
-    made["windows_used"] = (
-        dims,
-        table("windows", np.int32),
-        {"long_name": "windows used", "units": "1"},
+    statement = _entry_values(table, "statement", str), {"long_name": "result in one sentence"}
+    result = result.assign(
+        {
+            **_driver_series(product, drivers),
+            **_tabulate_statistics(table),
+            **_tabulate_slopes(product, names, drivers, table, level),
+            "statement": (_PLACE, *statement),
+        }
     )
-    label = "what the record shows about the coupling"
-    verdict_attrs = {"long_name": label, **flag_attributes(VERDICTS)}
-    made["coupling_verdict"] = (dims, table("verdict", np.int8), verdict_attrs)
-    masks = {name: 1 << bit for bit, name in enumerate(LIMITS)}
-    bits = [sum(masks[name] for name in entry["limits"]) for entry in ordered]
-    limit_attrs = {
-        "long_name": "what limits the verdict",
-        "flag_masks": np.array(list(masks.values()), np.int16),
-        "flag_meanings": " ".join(masks),
-    }
-    made["coupling_limits"] = (dims, np.array(bits, np.int16).reshape(shape), limit_attrs)
-    for v, name in enumerate(names):
-        for d, driver in enumerate(drivers):
-            attributes = {
-                "units": slope_units(str(product[name].attrs.get("units", "1")), driver.units),
-                "unit_label": slope_label(product[name], driver.units),
-            }
-            for key, text in _SLOPES.items():
-                suffix = "" if key == "slope" else f"_{key}"
-                series = name.replace("_", " ")
-                label = f"sensitivity of {series} to {driver.label}{text.format(level=100 * level)}"
-                made[f"{name}_per_{driver.name}{suffix}"] = (
-                    "axis",
-                    table(key)[:, v, d],
-                    {"long_name": label, **attributes},
-                )
-    made["statement"] = (
-        dims,
-        table("statement", str),
-        {"long_name": "result in one sentence"},
-    )
-    result = result.assign(made)
     labels = {
         "variable": (names, "variable of the product"),
         "driver": ([driver.name for driver in drivers], "channel that may drive the variable"),
@@ -151,6 +113,73 @@ def make_coupling_dataset(
         "interval_level": level,
     }
     return result.assign_attrs(longest_lag_s=longest)
+
+
+def _entry_values(table: Array, key: str, dtype: Any = np.float64) -> Array:
+    """Return one value of every entry in a table of entries, in its shape."""
+    return np.array([entry[key] for entry in table.flat], dtype).reshape(table.shape)
+
+
+def _driver_series(product: xr.Dataset, drivers: list[Driver]) -> dict[str, Any]:
+    """Return the series of every driver: the one in the product, or the means of its windows."""
+    made: dict[str, Any] = {}
+    for driver in drivers:
+        attributes = {"long_name": f"{driver.label}, mean of the window", "units": driver.units}
+        made[driver.name] = (
+            product[driver.name] if driver.of_product else ("time", driver.values[0], attributes)
+        )
+    return made
+
+
+def _tabulate_statistics(table: Array) -> dict[str, Any]:
+    """Return statistics, verdicts and their limits by (axis, variable, driver)."""
+    made: dict[str, Any] = {
+        name: (_PLACE, _entry_values(table, key), {"long_name": label, "units": units})
+        for name, (key, label, units) in _STATISTICS.items()
+    }
+    made["windows_used"] = (
+        _PLACE,
+        _entry_values(table, "windows", np.int32),
+        {"long_name": "windows used", "units": "1"},
+    )
+    label = "what the record shows about the coupling"
+    verdict_attrs = {"long_name": label, **flag_attributes(VERDICTS)}
+    made["coupling_verdict"] = (_PLACE, _entry_values(table, "verdict", np.int8), verdict_attrs)
+    masks = {name: 1 << bit for bit, name in enumerate(LIMITS)}
+    bits = [sum(masks[name] for name in entry["limits"]) for entry in table.flat]
+    limit_attrs = {
+        "long_name": "what limits the verdict",
+        "flag_masks": np.array(list(masks.values()), np.int16),
+        "flag_meanings": " ".join(masks),
+    }
+    made["coupling_limits"] = (_PLACE, np.array(bits, np.int16).reshape(table.shape), limit_attrs)
+    return made
+
+
+def _tabulate_slopes(
+    product: xr.Dataset,
+    names: list[str],
+    drivers: list[Driver],
+    table: Array,
+    level: float,
+) -> dict[str, Any]:
+    """Return the sensitivities of each variable to each driver, by axis."""
+    made: dict[str, Any] = {}
+    for (v, name), (d, driver) in itertools.product(enumerate(names), enumerate(drivers)):
+        attributes = {
+            "units": slope_units(str(product[name].attrs.get("units", "1")), driver.units),
+            "unit_label": slope_label(product[name], driver.units),
+        }
+        for key, text in _SLOPES.items():
+            suffix = "" if key == "slope" else f"_{key}"
+            series = name.replace("_", " ")
+            label = f"sensitivity of {series} to {driver.label}{text.format(level=100 * level)}"
+            made[f"{name}_per_{driver.name}{suffix}"] = (
+                "axis",
+                _entry_values(table[:, v, d], key),
+                {"long_name": label, **attributes},
+            )
+    return made
 
 
 def join(product: xr.Dataset, result: xr.Dataset) -> xr.Dataset:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,6 +59,28 @@ class Blocks(NamedTuple):
     laws: Laws
 
 
+@dataclass
+class _Design:
+    """A driver in the blocks of some series, and the terms and noise laws to fit with it."""
+
+    blocks: Blocks
+    driver: Floats  # (block, lag)
+    limits: set[str]  # what limits the verdict on any series
+    nuisance: Floats  # (block, term): terms fitted with the driver
+    timed: Floats  # offsets and trend
+    with_channels: Floats  # offsets, trend and the other channels
+
+    @cached_property
+    def laws(self) -> Laws:
+        """Noise laws without the nuisance terms."""
+        return project_out(self.blocks.laws, self.nuisance)
+
+    @cached_property
+    def white_laws(self) -> Laws:
+        """The law of white noise alone, without the nuisance terms."""
+        return project_out(decompose([_law_covariance(self.blocks, 0)], np.zeros(1)), self.nuisance)
+
+
 def make_blocks(
     mask: Bools, time: Floats, length: float, step: float, share: Floats
 ) -> Blocks | None:
@@ -106,8 +130,16 @@ def fit_driver(
     if blocks is None:
         reason = "too_few" if np.isfinite(driver.values).any() else "no_values"
         return [_empty_entry({reason}) for _ in series]
-    x = np.asarray(blocks.average @ driver.values[:, blocks.windows].T)
+    design = _make_design(blocks, driver, other_series)
+    if design.limits & {"constant", "too_few", "one_moment"}:
+        return [_empty_entry(design.limits, windows=blocks.windows.size) for _ in series]
     y = np.asarray(blocks.average @ series[:, blocks.windows].T)
+    return [_fit_series(design, row, lags, level) for row in y.T]
+
+
+def _make_design(blocks: Blocks, driver: Driver, other_series: list[Floats]) -> _Design:
+    """Average a driver over blocks, find what limits a fit of it, and the terms to fit with it."""
+    x = np.asarray(blocks.average @ driver.values[:, blocks.windows].T)
     limits = driver_limits(x[:, 0], blocks.pieces, driver.units, derived=driver.derived)
     timed = np.concatenate([blocks.offsets, blocks.trend], axis=1)
     nuisance = blocks.offsets if "no_reversal" in limits else timed
@@ -116,55 +148,49 @@ def fit_driver(
             limits = limits | {"too_few"}
         elif _largest_leverage(x[:, 0], nuisance) > _MAX_LEVERAGE:
             limits = limits | {"one_moment"}
-    if limits & {"constant", "too_few", "one_moment"}:
-        return [_empty_entry(limits, windows=blocks.windows.size) for _ in series]
-    other_series = [
+    averages = [
         np.asarray(blocks.average @ row[blocks.windows])
         for row in other_series
         if np.isfinite(row[blocks.windows]).all()
     ]
     with_channels = np.concatenate(
-        [timed, *(_standardise_series(row)[:, None] for row in other_series if np.ptp(row) > 0)],
+        [timed, *(_standardise_series(row)[:, None] for row in averages if np.ptp(row) > 0)],
         axis=1,
     )
-    laws = project_out(blocks.laws, nuisance)
-    white_laws = (
-        project_out(decompose([_law_covariance(blocks, 0)], np.zeros(1)), nuisance)
-        if "no_reversal" in limits
-        else None
-    )
-    entries = []
-    for row in y.T:
-        if np.ptp(row) == 0.0:
-            entries.append(_empty_entry(limits | {"constant_series"}, windows=blocks.windows.size))
-            continue
-        entry = _estimate_sensitivity(laws, row, x, lags, level) | {
-            "limits": set(limits),
-            "windows": blocks.windows.size,
-        }
-        column = x[:, entry["best"]]
+    return _Design(blocks, x, limits, nuisance, timed, with_channels)
+
+
+def _fit_series(design: _Design, row: Floats, lags: Floats, level: float) -> dict[str, Any]:
+    """Fit the block means of one series on a driver."""
+    blocks, x, limits, nuisance = design.blocks, design.driver, design.limits, design.nuisance
+    if np.ptp(row) == 0.0:
+        return _empty_entry(limits | {"constant_series"}, windows=blocks.windows.size)
+    entry = _estimate_sensitivity(design.laws, row, x, lags, level) | {
+        "limits": set(limits),
+        "windows": blocks.windows.size,
+    }
+    column = x[:, entry["best"]]
+    entry |= {
+        "correlation": _partial_correlation(row, column, np.ones((row.size, 1))),
+        "partial_time": _partial_correlation(row, column, design.timed),
+        "partial_channels": _partial_correlation(row, column, design.with_channels),
+        "effective": _effective_samples(row, column, nuisance, entry["stderr"]),
+    }
+    entry |= _fit_ramps(blocks, entry["law"], nuisance, row[:, None], column[:, None])
+    if "no_reversal" in limits:
+        white = _estimate_sensitivity(design.white_laws, row, x, lags, level)
         entry |= {
-            "correlation": _partial_correlation(row, column, np.ones((row.size, 1))),
-            "partial_time": _partial_correlation(row, column, timed),
-            "partial_channels": _partial_correlation(row, column, with_channels),
-            "effective": _effective_samples(row, column, nuisance, entry["stderr"]),
+            f"{key}_white": white[white_key]
+            for key, white_key in (("p", "p_search"), ("slope", "slope"), ("lag", "lag"))
         }
-        entry |= _fit_ramps(blocks, entry["law"], nuisance, row[:, None], column[:, None])
-        if white_laws is not None:
-            white = _estimate_sensitivity(white_laws, row, x, lags, level)
-            entry |= {
-                f"{key}_white": white[white_key]
-                for key, white_key in (("p", "p_search"), ("slope", "slope"), ("lag", "lag"))
-            }
-        if timed.shape[1] < with_channels.shape[1] < row.size - 3:
-            channel_fit = fit_lags(
-                project_out(blocks.laws, with_channels),
-                row[:, None] / np.std(row),
-                _standardise_series(column)[:, None],
-            )
-            entry["p_channels"] = float(p_values(channel_fit)[0, 0])
-        entries.append(entry)
-    return entries
+    if design.timed.shape[1] < design.with_channels.shape[1] < row.size - 3:
+        channel_fit = fit_lags(
+            project_out(blocks.laws, design.with_channels),
+            row[:, None] / np.std(row),
+            _standardise_series(column)[:, None],
+        )
+        entry["p_channels"] = float(p_values(channel_fit)[0, 0])
+    return entry
 
 
 def fit_partial_effects(
