@@ -79,39 +79,15 @@ def plot_adev(
         product.sel(axis=[name]).isel(time=[_select_window(product.sel(axis=name), when)]).compute()
     )
     window = windows.isel(axis=0, time=0)
-    tau = window["tau"].values
     figure = new_figure(width / INCH_MM, 4.4)
     panel = figure.subplots()
     colour = axis_style(product, name)["color"]
-    low, high = interval_limits(window["avar"].values, window["edf"].values)
-    panel.fill_between(
-        tau, np.sqrt(low), np.sqrt(high), color=colour, alpha=0.2, linewidth=0, label="95 % band"
-    )
-    deviation = np.sqrt(window["avar"].values)
-    panel.plot(
-        tau,
-        deviation,
-        color=colour,
-        marker="o",
-        markersize=3.5,
-        linewidth=1.2,
-        label=f"axis {name}, measured",
-    )
+    deviation, upper = _draw_measured(panel, window, colour)
     if "observable" in window:
         terms, total = fitted_curves(windows)
         shades = [shade for shade in COLOURS if shade != colour]
         _draw_terms(panel, window, terms[0, 0], total[0, 0], shades)
-    shown = deviation[np.isfinite(deviation) & (deviation > 0)]
-    panel.set_xlim(tau.min() / 1.3, tau.max() * 1.3)
-    if not shown.size:
-        panel.set_ylim(0.1, 10.0)
-        write_in_middle(panel, "no estimate in this window")
-    else:
-        panel.set_ylim(shown.min() / 4.0, np.nanmax(np.sqrt(high)) * 1.5)
-    panel.set_xscale("log")  # after the limits, which data of a constant signal do not give
-    panel.set_yscale("log")
-    label_log_axis(panel.xaxis, *panel.get_xlim())
-    label_log_axis(panel.yaxis, *panel.get_ylim())
+    _scale_panel(panel, window["tau"].values, deviation, upper)
     panel.set_xlabel("averaging time τ [s]")
     panel.set_ylabel(f"{variance_name(product)} deviation σ(τ) [deg/h]")
     panel.grid(alpha=0.3)
@@ -125,6 +101,41 @@ def plot_adev(
         f"window centred on {label_stamp(window['time'].values)} UTC",
     )
     return figure
+
+
+def _draw_measured(panel: Axes, window: xr.Dataset, colour: str) -> tuple[Floats, Floats]:
+    """Draw the Allan deviation with its band; return it, and the upper limit of the band."""
+    tau = window["tau"].values
+    low, high = interval_limits(window["avar"].values, window["edf"].values)
+    panel.fill_between(
+        tau, np.sqrt(low), np.sqrt(high), color=colour, alpha=0.2, linewidth=0, label="95 % band"
+    )
+    deviation = np.sqrt(window["avar"].values)
+    panel.plot(
+        tau,
+        deviation,
+        color=colour,
+        marker="o",
+        markersize=3.5,
+        linewidth=1.2,
+        label=f"axis {window['axis'].item()}, measured",
+    )
+    return deviation, np.sqrt(high)
+
+
+def _scale_panel(panel: Axes, tau: Floats, deviation: Floats, upper: Floats) -> None:
+    """Set limits and logarithmic scales; say so if nothing is drawn."""
+    shown = deviation[np.isfinite(deviation) & (deviation > 0)]
+    panel.set_xlim(tau.min() / 1.3, tau.max() * 1.3)
+    if not shown.size:
+        panel.set_ylim(0.1, 10.0)
+        write_in_middle(panel, "no estimate in this window")
+    else:
+        panel.set_ylim(shown.min() / 4.0, np.nanmax(upper) * 1.5)
+    panel.set_xscale("log")  # after the limits, which data of a constant signal do not give
+    panel.set_yscale("log")
+    label_log_axis(panel.xaxis, *panel.get_xlim())
+    label_log_axis(panel.yaxis, *panel.get_ylim())
 
 
 def _select_window(part: xr.Dataset, when: Any) -> int:

@@ -30,10 +30,14 @@ from gyrostab.time.stamps import to_nanoseconds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
+    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
 CMAP = "viridis"
 CHANGE_CMAP = "PuOr_r"  # safe for colour-blind readers, white where nothing changes
+#: Look of cells without an estimate.
+_EMPTY: dict[str, Any] = {"facecolor": "#d0d0d0", "edgecolor": "#909090", "hatch": "////"}
 _WEIGHTED = ESTIMATORS.index("weighted_clusters")
 
 
@@ -77,7 +81,6 @@ def plot_davar(
     product = with_axis(product)
     check_surface(product)
     from matplotlib.colors import LogNorm
-    from matplotlib.patches import Patch
 
     names = axis_names(product, axis)
     figure = new_figure(width / INCH_MM, 1.1 + 1.9 * len(names))
@@ -90,37 +93,14 @@ def plot_davar(
         cells = [(_divide_by_median(deviation), weighted) for deviation, weighted in cells]
     norm = LogNorm(*_colour_limits([deviation for deviation, _ in cells], relative=relative))
     for panel, name, (deviation, weighted) in zip(panels, names, cells, strict=True):
-        panel.set_facecolor("#d0d0d0")
-        panel.patch.set_hatch("////")
-        panel.patch.set_edgecolor("#909090")
-        shown = np.ma.masked_invalid(np.where(deviation > 0, deviation, np.nan))
-        mesh = panel.pcolormesh(
-            time_edges,
-            tau_edges,
-            shown.T,
-            norm=norm,
-            cmap=CHANGE_CMAP if relative else CMAP,
-            rasterized=True,
-        )
+        mesh = _draw_cells(panel, time_edges, tau_edges, deviation, norm, relative=relative)
         _mark_weighted(panel, time_edges, tau, weighted)
         panel.set_yscale("log", subs=(2, 5))
         label_log_axis(panel.yaxis, tau[0], tau[-1])
         panel.set_ylabel(f"axis {name}\naveraging time τ [s]")
     kind = f"{variance_name(product)} deviation"
     label = "σ(τ) / its median over time" if relative else f"{kind} σ(τ) [deg/h]"
-    handles: list[Any] = []
-    if any(not (deviation > 0).all() for deviation, _ in cells):
-        handles.append(
-            Patch(
-                facecolor="#d0d0d0",
-                edgecolor="#909090",
-                hatch="////",
-                label="no estimate (gap, or too few terms)",
-            )
-        )
-    if any(weighted.any() for _, weighted in cells):
-        handles.append(_dot_handle())
-    if handles:
+    if handles := _cell_handles(cells):
         figure.legend(
             handles=handles,
             loc="outside lower left",
@@ -232,6 +212,42 @@ def _merge_windows(
     # the published recursion drifts below zero where there is almost no noise
     deviation = np.sqrt(np.where(avar >= 0.0, avar, np.nan))
     return list(zip(deviation, weighted & np.isfinite(deviation), strict=True)), merged
+
+
+def _draw_cells(
+    panel: Axes,
+    time_edges: Array,
+    tau_edges: Array,
+    deviation: Array,
+    norm: Normalize,
+    *,
+    relative: bool,
+) -> QuadMesh:
+    """Draw the cells of one axis as colours, on a hatched background."""
+    panel.set_facecolor(_EMPTY["facecolor"])
+    panel.patch.set_hatch(_EMPTY["hatch"])
+    panel.patch.set_edgecolor(_EMPTY["edgecolor"])
+    shown = np.ma.masked_invalid(np.where(deviation > 0, deviation, np.nan))
+    return panel.pcolormesh(
+        time_edges,
+        tau_edges,
+        shown.T,
+        norm=norm,
+        cmap=CHANGE_CMAP if relative else CMAP,
+        rasterized=True,
+    )
+
+
+def _cell_handles(cells: list[tuple[Array, Array]]) -> list[Any]:
+    """List the legend's handles of empty and of weighted cells, where there are any."""
+    from matplotlib.patches import Patch
+
+    handles: list[Any] = []
+    if any(not (deviation > 0).all() for deviation, _ in cells):
+        handles.append(Patch(**_EMPTY, label="no estimate (gap, or too few terms)"))
+    if any(weighted.any() for _, weighted in cells):
+        handles.append(_dot_handle())
+    return handles
 
 
 def _divide_by_median(deviation: Array) -> Array:
