@@ -84,28 +84,17 @@ def to_disk(
     variables: dict[Any, xr.Variable] = {}
     for name, variable in dataset.variables.items():
         variable = _convert_type(name, variable)
-        known_attrs = {key: item for key, item in variable.attrs.items() if key not in DECODING}
         if name in grids:
-            encoded = encode_grid(grids[name], known_attrs, divisor, stamps=stamps)
+            encoded = encode_grid(grids[name], _plain_attributes(variable), divisor, stamps=stamps)
             variables[name if stamps else f"{name}_start"] = encoded
-            continue
-        is_index = name in dataset.dims
-        stored = variable if is_index else transpose_lazy(_make_lazy(variable), _DISK_ORDER)
-        label = _LONG_NAMES.get(str(name), str(name).replace("_", " "))
-        attrs = encode_attributes({"long_name": label, **known_attrs})
-        data = variable.values if is_index else stored.data
-        if variable.dtype.kind == "M":
-            data = encode_stamps(name, stored, divisor)
-            if is_index:
-                attrs = {"standard_name": "time", "axis": "T", **attrs}
-            if name not in bounds:
-                attrs |= time_attributes(divisor)
-        packing = (
-            {key: variable.encoding[key] for key in PACKING if key in variable.encoding}
-            if "scale_factor" in variable.encoding
-            else {}
-        )
-        variables[name] = xr.Variable(stored.dims, data, {} if name in bounds else attrs, packing)
+        else:
+            variables[name] = _encode_variable(
+                name,
+                variable,
+                divisor,
+                is_index=name in dataset.dims,
+                is_bounds=name in bounds,
+            )
     coords = {
         name: variables.pop(name)
         for name in list(dataset.coords)
@@ -123,6 +112,32 @@ def to_disk(
         stored_set["avar"].attrs["ancillary_variables"] = " ".join(ancillary)
     stored_set.attrs = make_global_attributes(dataset, kind, verb)
     return stored_set
+
+
+def _plain_attributes(variable: xr.Variable) -> dict[Any, Any]:
+    """Return the attributes that do not decode stored numbers."""
+    return {key: item for key, item in variable.attrs.items() if key not in DECODING}
+
+
+def _encode_variable(
+    name: Any, variable: xr.Variable, divisor: int, *, is_index: bool, is_bounds: bool
+) -> xr.Variable:
+    """Encode values, attributes and packing of a variable that is not a computed time axis."""
+    stored = variable if is_index else transpose_lazy(_make_lazy(variable), _DISK_ORDER)
+    label = _LONG_NAMES.get(str(name), str(name).replace("_", " "))
+    attrs = encode_attributes({"long_name": label, **_plain_attributes(variable)})
+    data = variable.values if is_index else stored.data
+    if variable.dtype.kind == "M":
+        data = encode_stamps(name, stored, divisor)
+        if is_index:
+            attrs = {"standard_name": "time", "axis": "T", **attrs}
+        attrs |= time_attributes(divisor)
+    packing = (
+        {key: variable.encoding[key] for key in PACKING if key in variable.encoding}
+        if "scale_factor" in variable.encoding
+        else {}
+    )
+    return xr.Variable(stored.dims, data, {} if is_bounds else attrs, packing)
 
 
 def _convert_type(name: Any, variable: xr.Variable) -> xr.Variable:
