@@ -299,10 +299,7 @@ def _compute_missing(
     parts = davar_parts(log, **windows)
     begin_job(job.folder, job.fingerprint, parts=len(parts), overwrite=overwrite)
     blocks.update(find_blocks(job.folder, parts, job=job.name))
-    axis = windows.get("axis")
-    total = log.sizes["time"] * (
-        log.sizes["axis"] if axis is None else 1 if isinstance(axis, str) else len(axis)
-    )
+    total = _count_analysed(log, windows.get("axis"))
 
     def advance() -> None:
         done = sum(block.part.stop - block.part.start for block in blocks.values())
@@ -317,13 +314,8 @@ def _compute_missing(
 
     call: tuple[Any, ...] = (compute_own_part,)
     if pool.remote and len(blocks) < len(parts):
-        # every worker can open logs of gyrostab, which do not mix with others
-        kinds = (read_attribute(path, "gyrostab_content") for path in job.files)
-        if "log" not in kinds:
-            stage("storing", 0)
-            log = load_log([to_zarr(log, job.folder / "log.zarr", stamps=False)])
-        copy = zlib.compress(pickle.dumps(log), level=1)  # holds names and places, not samples
-        call = (_compute_part_of_copy, pool.share(copy), windows, fitting)
+        copy = pool.share(_pack_log(job, log, stage))
+        call = (_compute_part_of_copy, copy, windows, fitting)
     advance()
     compute_blocks(
         job.folder,
@@ -335,6 +327,25 @@ def _compute_missing(
         check=partial(_check_inputs, job),
         advance=advance,
     )
+
+
+def _count_analysed(log: xr.Dataset, axis: str | Sequence[str] | None) -> int:
+    """Count the samples of the axes that are analysed; None means all axes."""
+    n_axes = log.sizes["axis"] if axis is None else 1 if isinstance(axis, str) else len(axis)
+    return int(log.sizes["time"] * n_axes)
+
+
+def _pack_log(job: _Job, log: xr.Dataset, stage: Stage) -> bytes:
+    """Pack a log for workers in other processes, which can open logs of gyrostab.
+
+    Other logs are first stored in the folder of the job.
+    """
+    # logs of gyrostab do not mix with others
+    kinds = (read_attribute(path, "gyrostab_content") for path in job.files)
+    if "log" not in kinds:
+        stage("storing", 0)
+        log = load_log([to_zarr(log, job.folder / "log.zarr", stamps=False)])
+    return zlib.compress(pickle.dumps(log), level=1)  # holds names and places, not samples
 
 
 def _check_inputs(job: _Job) -> None:
