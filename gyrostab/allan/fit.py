@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import dask.array as da
@@ -287,49 +288,76 @@ def _fit_windows(
         cells[1] = cells[1] * filter_response(tau, constant)
     cells += [np.broadcast_to(values, cells[-1].shape) for values in (constant, error)]
 
-    def block(*arrays: Floats) -> Floats:
-        flat = [
-            np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64)
-            for a in arrays[:5]
-        ]
-        trend, *shares, exact, filtered, white_error = (
-            np.asarray(a, dtype=np.float64).reshape(-1) for a in arrays[5:]
-        )
-        responses = np.stack(shares, axis=-1)
-        fitted = np.empty((filtered.size, width))
-        for rows, terms in ((filtered == 0, allowed), (filtered > 0, allowed & ~term_bits("Q"))):
-            if rows.any():
-                fitted[rows] = fit_block(
-                    [a[rows] for a in flat],
-                    trend[rows],
-                    responses[rows],
-                    exact[rows],
-                    tables,
-                    white_error=white_error[rows],
-                    allowed=terms,
-                    observed_only=observed_only,
-                )
-        return fitted.reshape(*arrays[0].shape[:2], width)
-
     width = len(TERMS) * 4 + 2 + chosen.size
+    fit_cells = partial(
+        _fit_cells,
+        chosen=chosen,
+        tables=tables,
+        width=width,
+        allowed=allowed,
+        observed_only=observed_only,
+    )
+    fitted = fit_cells(*cells) if immediate else _map_blocks(fit_cells, cells, width)
+    out = _label_fit(fitted)
+    # otherwise that of davar is kept, for every averaging time and from more of them
+    if surface.sizes["tau"] == chosen.size > allowed.bit_count():
+        edf = np.where(below, surface["edf"].data, fitted[..., 4 * len(TERMS) + 2 :])
+        out["edf"] = (("axis", "time", "tau"), edf, surface["edf"].attrs)
+    return surface.assign(out)
 
-    if immediate:
-        fitted = block(*cells)
-    else:
-        lazy = isinstance(cells[0], da.Array)
-        chunks = (*cells[0].chunks[:2], -1) if lazy else (1, 256, -1)
-        chunked = [
-            cell.rechunk(chunks) if isinstance(cell, da.Array) else da.from_array(cell, chunks)
-            for cell in cells
-        ]
-        fitted = da.map_blocks(
-            block,
-            *chunked,
-            chunks=(*chunked[0].chunks[:2], (width,)),
-            meta=np.empty((0, 0, 0)),  # without it, dask calls the function with empty arrays
-        )
-        if not lazy:
-            fitted = fitted.compute()
+
+def _fit_cells(
+    *arrays: Floats,
+    chosen: Ints,
+    tables: Any,
+    width: int,
+    allowed: int,
+    observed_only: bool,
+) -> Floats:
+    """Fit windows (axis, time), with or without a filter; the results have the size `width`."""
+    flat = [
+        np.ascontiguousarray(a[..., chosen].reshape(-1, chosen.size), dtype=np.float64)
+        for a in arrays[:5]
+    ]
+    trend, *shares, exact, filtered, white_error = (
+        np.asarray(a, dtype=np.float64).reshape(-1) for a in arrays[5:]
+    )
+    responses = np.stack(shares, axis=-1)
+    fitted = np.empty((filtered.size, width))
+    for rows, terms in ((filtered == 0, allowed), (filtered > 0, allowed & ~term_bits("Q"))):
+        if rows.any():
+            fitted[rows] = fit_block(
+                [a[rows] for a in flat],
+                trend[rows],
+                responses[rows],
+                exact[rows],
+                tables,
+                white_error=white_error[rows],
+                allowed=terms,
+                observed_only=observed_only,
+            )
+    return fitted.reshape(*arrays[0].shape[:2], width)
+
+
+def _map_blocks(fit_cells: Callable[..., Floats], cells: list[Any], width: int) -> Any:
+    """Fit the cells block by block; lazily if they are lazy."""
+    lazy = isinstance(cells[0], da.Array)
+    chunks = (*cells[0].chunks[:2], -1) if lazy else (1, 256, -1)
+    chunked = [
+        cell.rechunk(chunks) if isinstance(cell, da.Array) else da.from_array(cell, chunks)
+        for cell in cells
+    ]
+    fitted = da.map_blocks(
+        fit_cells,
+        *chunked,
+        chunks=(*chunked[0].chunks[:2], (width,)),
+        meta=np.empty((0, 0, 0)),  # without it, dask calls the function with empty arrays
+    )
+    return fitted if lazy else fitted.compute()
+
+
+def _label_fit(fitted: Any) -> dict[str, Any]:
+    """Make the variables of a fit from the results of `fit_block` (axis, time, result)."""
     n = len(TERMS)
     plane = ("axis", "time")
     out: dict[str, Any] = {}
@@ -341,9 +369,4 @@ def _fit_windows(
     out["observable"] = ((*plane, "term"), fitted[..., 3 * n : 4 * n].astype(np.int8))
     out |= {"fit_chi2": (plane, fitted[..., 4 * n]), "fit_dof": (plane, fitted[..., 4 * n + 1])}
     out["term"] = ("term", list(TERMS))
-    out = {name: (*variable, attributes(name)) for name, variable in out.items()}
-    # otherwise that of davar is kept, for every averaging time and from more of them
-    if surface.sizes["tau"] == chosen.size > allowed.bit_count():
-        edf = np.where(below, surface["edf"].data, fitted[..., 4 * n + 2 :])
-        out["edf"] = (("axis", "time", "tau"), edf, surface["edf"].attrs)
-    return surface.assign(out)
+    return {name: (*variable, attributes(name)) for name, variable in out.items()}
