@@ -242,44 +242,8 @@ def from_dataarray(
 
 def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[xr.Dataset, bool]:
     """Convert an array to a log with unchecked time; also return whether it has increments."""
-    if not isinstance(da, xr.DataArray):
-        raise SchemaError(
-            f"this is a {type(da).__name__}; give an xarray.DataArray, for instance the variable "
-            "of a Dataset that holds the gyro, dataset['gyro']"
-        )
-    refuse_multi_index(da, "DataArray")
-    if "unit_label" in da.attrs:
-        raise SchemaError(
-            f"this is {da.attrs.get('long_name', da.name)} by window, not a gyro signal; give the "
-            "log, or the whole product"
-        )
-    if set(da.dims) not in ({"time"}, {"axis", "time"}):
-        raise SchemaError(
-            f"the DataArray has dimensions {da.dims}; a log has 'time', or 'axis' and 'time': "
-            "rename them, da.rename(...)"
-        )
-    if "time" not in da.coords or da["time"].dtype.kind != "M":
-        advice = advise_dates(da["time"].values, "da") if "time" in da.coords else ""
-        raise SchemaError(
-            "the DataArray has no datetime64 coordinate 'time'; "
-            + (
-                f"convert its dates: {advice}"
-                if advice
-                else "give it one, or use gyrostab.make_log(values, rate=..., unit=...)"
-            )
-        )
-    unit = _unit_of(da, units)
-    if kind not in (None, "rate", "angle"):
-        raise OptionError(f"kind={kind!r}: give 'rate' or 'angle'")
-    if unit.quantity == "angle" and kind is None and da.name != "angle":
-        raise OptionError(
-            f"the values are angles ({unit.text}): give kind='angle' if they are cumulative, "
-            "kind='rate' if increments"
-        )
-    increments = unit.quantity == "angle" and kind == "rate"
-    if unit.quantity == "rate" and kind == "angle":
-        raise OptionError(f"kind='angle', but {unit.text!r} is a unit of rates; leave kind out")
-    name = "angle" if unit.quantity == "angle" and not increments else "rate"
+    _check_array(da)
+    unit, name, increments = _find_signal(da, units, kind)
     axes = name_axes(da)
     array = da if "axis" in da.dims else da.drop_vars("axis", errors="ignore").expand_dims("axis")
     signal = array.variable.transpose("axis", "time")
@@ -307,6 +271,53 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
     bare = bare.drop_vars([coord for coord in bare.coords if coord not in ("time", "axis")])
     log = bare.assign({name: (("axis", "time"), data, attrs, packing)})
     return log.assign_coords(axis=axes).assign_attrs(log_attrs), increments
+
+
+def _check_array(da: Any) -> None:
+    """Raise `SchemaError` unless this is a gyro signal over dates, and over axes if it has them."""
+    if not isinstance(da, xr.DataArray):
+        raise SchemaError(
+            f"this is a {type(da).__name__}; give an xarray.DataArray, for instance the variable "
+            "of a Dataset that holds the gyro, dataset['gyro']"
+        )
+    refuse_multi_index(da, "DataArray")
+    if "unit_label" in da.attrs:
+        raise SchemaError(
+            f"this is {da.attrs.get('long_name', da.name)} by window, not a gyro signal; give the "
+            "log, or the whole product"
+        )
+    if set(da.dims) not in ({"time"}, {"axis", "time"}):
+        raise SchemaError(
+            f"the DataArray has dimensions {da.dims}; a log has 'time', or 'axis' and 'time': "
+            "rename them, da.rename(...)"
+        )
+    if "time" not in da.coords or da["time"].dtype.kind != "M":
+        advice = advise_dates(da["time"].values, "da") if "time" in da.coords else ""
+        raise SchemaError(
+            "the DataArray has no datetime64 coordinate 'time'; "
+            + (
+                f"convert its dates: {advice}"
+                if advice
+                else "give it one, or use gyrostab.make_log(values, rate=..., unit=...)"
+            )
+        )
+
+
+def _find_signal(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[Unit, str, bool]:
+    """Return the unit of an array, the name of its signal, and whether it holds increments."""
+    unit = _unit_of(da, units)
+    if kind not in (None, "rate", "angle"):
+        raise OptionError(f"kind={kind!r}: give 'rate' or 'angle'")
+    if unit.quantity == "angle" and kind is None and da.name != "angle":
+        raise OptionError(
+            f"the values are angles ({unit.text}): give kind='angle' if they are cumulative, "
+            "kind='rate' if increments"
+        )
+    increments = unit.quantity == "angle" and kind == "rate"
+    if unit.quantity == "rate" and kind == "angle":
+        raise OptionError(f"kind='angle', but {unit.text!r} is a unit of rates; leave kind out")
+    name = "angle" if unit.quantity == "angle" and not increments else "rate"
+    return unit, name, increments
 
 
 def _unit_of(da: xr.DataArray, units: str | None) -> Unit:

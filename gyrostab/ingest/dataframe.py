@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -15,6 +15,9 @@ import xarray as xr
 from gyrostab.errors import GyrostabError, MissingUnitError, SchemaError, TimeError
 from gyrostab.ingest.combine import warn_notes
 from gyrostab.schema import texts
+
+if TYPE_CHECKING:
+    from gyrostab.ingest.options import ReadOptions
 
 #: An option of a command with its value, as messages on files advise it.
 _OPTION = re.compile(
@@ -113,10 +116,9 @@ def _read_frame(
     kind: str | None = None,
 ) -> xr.Dataset:
     """Read a pandas table into a raw log, by the rules for files."""
-    from gyrostab.ingest.columns.headers import FileColumn, split_header
+    from gyrostab.ingest.columns.headers import FileColumn
     from gyrostab.ingest.columns.plan_roles import plan_columns
     from gyrostab.ingest.columns.typed import read_columns
-    from gyrostab.ingest.options import ReadOptions
     from gyrostab.ingest.reading import refuse_unused_options
 
     table = (
@@ -135,19 +137,9 @@ def _read_frame(
             f"the DataFrame has {len(table)} rows and {table.shape[1]} columns; a log needs at "
             "least two rows and a column for a gyro axis"
         )
-    units = frame.attrs.get("units") if units is None else units
     headers = [str(column) for column in table.columns]
-    renamed = {str(key): name for key, name in (map or {}).items()}
-    if not isinstance(units, Mapping):
-        keys = {key.strip().lower() for key in renamed}
-        lows = {header: split_header(header)[0].lower() for header in headers}
-        renamed |= {
-            header: f"gyro_{low}"
-            for header, low in lows.items()
-            if low in ("x", "y", "z") and keys.isdisjoint((low, header.strip().lower()))
-        }
-    units_by_name = {"gyro": str(units)} if isinstance(units, str) else dict(units or {})
-    options = ReadOptions(map=renamed, unit=units_by_name, kind=kind)
+    units = frame.attrs.get("units") if units is None else units
+    options = _make_options(headers, units=units, map=map, kind=kind)
     stamps = index.to_numpy()
 
     def fetch(source: int, begin: int, end: int) -> Any:
@@ -167,6 +159,30 @@ def _read_frame(
             f"or the name of the column, '{stem}_x [{unit}]'"
         ) from error
     return raw
+
+
+def _make_options(
+    headers: Sequence[str],
+    *,
+    units: str | Mapping[str, str] | None,
+    map: Mapping[str, str] | None,
+    kind: str | None,
+) -> ReadOptions:
+    """Convert keywords to options for files; a unit of all axes lets x, y and z name axes."""
+    from gyrostab.ingest.columns.headers import split_header
+    from gyrostab.ingest.options import ReadOptions
+
+    renamed = {str(key): name for key, name in (map or {}).items()}
+    if not isinstance(units, Mapping):
+        keys = {key.strip().lower() for key in renamed}
+        lows = {header: split_header(header)[0].lower() for header in headers}
+        renamed |= {
+            header: f"gyro_{low}"
+            for header, low in lows.items()
+            if low in ("x", "y", "z") and keys.isdisjoint((low, header.strip().lower()))
+        }
+    units_by_name = {"gyro": str(units)} if isinstance(units, str) else dict(units or {})
+    return ReadOptions(map=renamed, unit=units_by_name, kind=kind)
 
 
 @contextmanager

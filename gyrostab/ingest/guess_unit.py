@@ -110,16 +110,8 @@ def guess_unit(inspection: FileInspection, guess: Guess, *, angles: bool) -> Non
     A unit in the header that is not known leaves the guess to names and numbers.
     """
     group, warnings = guess.group, guess.warnings
-    for column in group:
-        in_header = given_unit(column)
-        named = column.unit if in_header else name_unit(column, "rate")
-        if named is None and not angles and (angle := name_unit(column, "angle")):
-            named = f"{angle}/s"
-        if named is not None and is_unit_of(named, ("rate",)):
-            by = "that of another axis" if in_header else "name"
-            guess.reasons.append(f"unit {named}, by {by}")
-            guess.unit = named
-            return
+    if _guess_by_name(guess, angles=angles):
+        return
     units = {
         unit: is_unit(unit) or is_unit_of(unit, ("number",)) or _names_counts(unit)
         for unit in (column.unit for column in group)
@@ -145,10 +137,30 @@ def guess_unit(inspection: FileInspection, guess: Guess, *, angles: bool) -> Non
     if counts or large or all(c.whole for c in group):
         guess.unit = _scale_of_counts(guess)
         return
+    _guess_by_noise(guess)
+
+
+def _guess_by_name(guess: Guess, *, angles: bool) -> bool:
+    """Guess the unit by the headers of the columns; return whether one names it."""
+    for column in guess.group:
+        in_header = given_unit(column)
+        named = column.unit if in_header else name_unit(column, "rate")
+        if named is None and not angles and (angle := name_unit(column, "angle")):
+            named = f"{angle}/s"
+        if named is not None and is_unit_of(named, ("rate",)):
+            by = "that of another axis" if in_header else "name"
+            guess.reasons.append(f"unit {named}, by {by}")
+            guess.unit = named
+            return True
+    return False
+
+
+def _guess_by_noise(guess: Guess) -> None:
+    """Guess the unit in which mean and noise are most plausible for a gyro."""
     rate = guess.sampling_rate_hz if guess.sampling_rate_hz > 0 else TYPICAL_RATE_HZ
-    means = np.array([c.mean for c in group])
-    scatter = float(np.median([c.scatter for c in group]))
-    top = max(max(abs(c.low), abs(c.high)) for c in group)
+    means = np.array([c.mean for c in guess.group])
+    scatter = float(np.median([c.scatter for c in guess.group]))
+    top = max(max(abs(c.low), abs(c.high)) for c in guess.group)
     scores = {
         unit: rate_plausibility(means, scatter, top, parse_unit(unit).factor, rate)
         for unit in ("rad/s", "deg/s", "deg/h")
@@ -160,7 +172,7 @@ def guess_unit(inspection: FileInspection, guess: Guess, *, angles: bool) -> Non
         f"unit {unit}, by the noise: {walk:.2g} deg/sqrt(h); the mean is "
         f"{np.linalg.norm(means) * factor:.4g} deg/h"
     )
-    warnings.append(
+    guess.warnings.append(
         f"the unit {unit} is a guess from the numbers, as the file states no known unit; check it "
         "with the data sheet"
     )

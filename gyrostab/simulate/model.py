@@ -146,47 +146,8 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
     >>> read_model({"noise": {"N": 0.003, "z": {"N": "0.005 deg/sqrt(h)"}}}).coefficients("z")["N"]
     0.005
     """
-    if isinstance(model, Mapping):
-        try:
-            where, tables, text = "model", dict(model), json.dumps(model, default=str)
-        except (TypeError, ValueError) as error:
-            raise OptionError(
-                f"the mapping of the model cannot be kept as text ({error}); "
-                "give the tables of docs/simulate.md, with names as text"
-            ) from error
-    elif not isinstance(model, str | os.PathLike):
-        raise OptionError(
-            f"the model is of type {type(model).__name__}; give a TOML file, a mapping of its "
-            "tables, or what gyrostab.read_model returns"
-        )
-    else:
-        where, path = str(model), Path(model)
-        try:
-            text = read_toml_text(path)
-            tables = parse_toml(text)
-        except OSError as error:
-            raise FormatError(f"{path}: cannot be read ({error.strerror})") from error
-        except (ValueError, RecursionError) as error:
-            raise FormatError(f"{path}: not a TOML file ({error})") from error
-    sections = ("log", "noise", "bias", "delay", "effect", "environment")
-    for key, table in tables.items():
-        if key not in sections:
-            raise OptionError(
-                f"{where}: there is no section {key!r}{close_to(key, sections)}; "
-                "there are [log], [noise], [bias], [delay], [[effect]], [[environment]]"
-            )
-        if not isinstance(table, list if key in ("effect", "environment") else Mapping):
-            raise OptionError(
-                f"{where}: write {key} as "
-                f"{'[[' + key + ']]' if key in ('effect', 'environment') else '[' + key + ']'}"
-            )
-    for key in ("effect", "environment"):
-        for number, table in enumerate(tables.get(key, []), start=1):
-            if not isinstance(table, Mapping):
-                raise OptionError(
-                    f"{where}: {key} {number} is {table!r}, not a table; "
-                    f"write [[{key}]] and its parameters below"
-                )
+    where, tables, text = _read_tables(model)
+    _check_sections(tables, where)
     noise, band = _read_noise(tables.get("noise", {}), where)
     effects = [
         make_effect(table, where=f"{where}, effect {number}")
@@ -212,6 +173,56 @@ def read_model(model: str | os.PathLike[str] | Mapping[str, Any]) -> Model:
     )
     _check_axes(parsed_model)
     return parsed_model
+
+
+def _read_tables(
+    model: str | os.PathLike[str] | Mapping[str, Any],
+) -> tuple[str, dict[str, Any], str]:
+    """Read the tables of a model; return what to call it in messages, the tables and their text."""
+    if isinstance(model, Mapping):
+        try:
+            return "model", dict(model), json.dumps(model, default=str)
+        except (TypeError, ValueError) as error:
+            raise OptionError(
+                f"the mapping of the model cannot be kept as text ({error}); "
+                "give the tables of docs/simulate.md, with names as text"
+            ) from error
+    if not isinstance(model, str | os.PathLike):
+        raise OptionError(
+            f"the model is of type {type(model).__name__}; give a TOML file, a mapping of its "
+            "tables, or what gyrostab.read_model returns"
+        )
+    path = Path(model)
+    try:
+        text = read_toml_text(path)
+        return str(model), parse_toml(text), text
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{path}: not a TOML file ({error})") from error
+
+
+def _check_sections(tables: Mapping[str, Any], where: str) -> None:
+    """Raise `OptionError` for an unknown section, and for one that is not a table or a list."""
+    sections = ("log", "noise", "bias", "delay", "effect", "environment")
+    for key, table in tables.items():
+        if key not in sections:
+            raise OptionError(
+                f"{where}: there is no section {key!r}{close_to(key, sections)}; "
+                "there are [log], [noise], [bias], [delay], [[effect]], [[environment]]"
+            )
+        if not isinstance(table, list if key in ("effect", "environment") else Mapping):
+            raise OptionError(
+                f"{where}: write {key} as "
+                f"{'[[' + key + ']]' if key in ('effect', 'environment') else '[' + key + ']'}"
+            )
+    for key in ("effect", "environment"):
+        for number, table in enumerate(tables.get(key, []), start=1):
+            if not isinstance(table, Mapping):
+                raise OptionError(
+                    f"{where}: {key} {number} is {table!r}, not a table; "
+                    f"write [[{key}]] and its parameters below"
+                )
 
 
 def _read_noise(
