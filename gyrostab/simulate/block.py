@@ -91,13 +91,7 @@ def next_block(
     state = copy.deepcopy(state)
     factor = plan.oversampling
     index = first * factor + np.arange(count * factor)
-    instants = grid_times(plan.start, plan.rate * factor, index)
-    before = int(grid_times(plan.start, plan.rate * factor, max(first * factor - 1, 0)))
-    channels = {}
-    for name, source in plan.sources.items():
-        channels[name], state.drivers[name] = source.at(
-            instants, state.drivers.get(name), before=before
-        )
+    channels = _read_channels(plan, state, first * factor, index)
     true = {axis: np.zeros(index.size) for axis in plan.axes}
     if plan.turning:
         true[plan.turning] = channels["rotation_rate"] * HOUR
@@ -147,6 +141,21 @@ def next_block(
     change("logger", slow, true=true, fast=False)
     _drop_gaps(plan, slow, first)
     return slow, state
+
+
+def _read_channels(
+    plan: SimulationPlan, state: BlockState, first: int, index: Ints
+) -> dict[str, Any]:
+    """Interpolate the channels at samples of the instrument, from `first` on; changes `state`."""
+    rate = plan.rate * plan.oversampling
+    instants = grid_times(plan.start, rate, index)
+    before = int(grid_times(plan.start, rate, max(first - 1, 0)))
+    channels = {}
+    for name, source in plan.sources.items():
+        channels[name], state.drivers[name] = source.at(
+            instants, state.drivers.get(name), before=before
+        )
+    return channels
 
 
 def _add_noise(
