@@ -58,29 +58,7 @@ def baseline_from_model(
     """
     parsed = model if isinstance(model, Model) else read_model(model)
     axes = [str(axis) for axis in blocks["axis"].values]
-    posteriors = []
-    for axis in axes:
-        coefficients = parsed.coefficients(axis)
-        square = np.array([coefficients[term] ** 2 for term in NOISE])
-        if not square.any():
-            raise OptionError(
-                f"{parsed.source}: axis {axis} has no noise to compare a recording with; "
-                f"give N in [noise] or [noise.{axis}]"
-            )
-        draws = np.tile(square, (DRAWS, 1))
-        K, B = np.array([coefficients["K"]]), np.array([coefficients["B"]])
-        posteriors.append(
-            Posterior(
-                square=square,
-                error=np.zeros(4),
-                K=K,
-                B=B,
-                weight=np.ones(1),
-                draws=draws,
-                slow=draws[:, 2:],
-                joined=True,
-            )
-        )
+    posteriors = [_given_posterior(parsed, axis) for axis in axes]
     chosen = np.ones((len(axes), blocks.sizes["block"]), np.bool_)
     attrs: dict[str, Any] = {"source": "model", "calibrated_on": [], "model": parsed.source}
     given_blocks = given_quiescent_blocks(blocks, quiet, settings=settings)
@@ -113,6 +91,29 @@ def baseline_from_model(
     out["coefficient"].loc[{"term": "R"}] = ramp
     out["stderr"].loc[{"term": list(TERMS) if given_blocks is None else ["R"]}] = 0.0
     return out
+
+
+def _given_posterior(model: Model, axis: str) -> Posterior:
+    """Return the noise of an axis of a model, known without error."""
+    coefficients = model.coefficients(axis)
+    square = np.array([coefficients[term] ** 2 for term in NOISE])
+    if not square.any():
+        raise OptionError(
+            f"{model.source}: axis {axis} has no noise to compare a recording with; "
+            f"give N in [noise] or [noise.{axis}]"
+        )
+    draws = np.tile(square, (DRAWS, 1))
+    K, B = np.array([coefficients["K"]]), np.array([coefficients["B"]])
+    return Posterior(
+        square=square,
+        error=np.zeros(4),
+        K=K,
+        B=B,
+        weight=np.ones(1),
+        draws=draws,
+        slow=draws[:, 2:],
+        joined=True,
+    )
 
 
 def expect_ramp(blocks: xr.Dataset, ramp: Floats) -> Floats:

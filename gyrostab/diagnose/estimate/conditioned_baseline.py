@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import xarray as xr
 
-from gyrostab.arrays import Bools, Complexes
+from gyrostab.arrays import Bools, Complexes, Floats
 from gyrostab.diagnose.baseline.known_effects import GRID_MARK
 from gyrostab.diagnose.estimate.joint_fit import Fitted
 from gyrostab.diagnose.identify.identifications import Identifications
@@ -78,21 +78,10 @@ def predict_baseline(
         for place, columns in state.given.items():
             flags = is_left_out.setdefault(place, [])
             flags += [identification in left_out] * (len(columns) - len(flags))
-    spectrum = state.expected_power.copy()
-    for row, axis in enumerate(state.axes):
-        places = (("power", axis), ("added_power", axis))  # as in `State.power_columns`
-        dropped = np.array([flag for at in places for flag in is_left_out.get(at, [])], np.bool_)
-        if dropped.any():
-            spectrum[row] = fit_powers(state, axis, dropped)
+    spectrum = _fit_spectrum(state, is_left_out)
     state = replace(state, blocks=usable_blocks, masked=identifications.state.masked)
     empty_state = replace(state, given={})
-    mean = baseline["known_mean"].values.copy()
-    for row, axis in enumerate(state.axes):
-        columns = state.given.get(("mean", axis), [])
-        is_kept = ~np.array(is_left_out.get(("mean", axis), []), np.bool_)
-        if is_kept.any():
-            size, _ = mean_mixture(empty_state, axis, columns).moments()
-            mean[row] += np.tensordot(size[is_kept], np.stack(columns)[is_kept], axes=1)
+    mean = _fit_means(state, empty_state, baseline["known_mean"].values, is_left_out)
     predicted = state.baseline.assign(
         spectrum=baseline["spectrum"].copy(data=spectrum),
         known_mean=baseline["known_mean"].copy(data=mean),
@@ -113,6 +102,34 @@ def predict_baseline(
     return predicted.assign(
         cross=(("pair", "block", "band"), cross if expected is None else cross + expected)
     )
+
+
+def _fit_spectrum(state: State, is_left_out: Mapping[tuple[str, str], list[bool]]) -> Floats:
+    """Return the expected power (axis, block, band) without the columns that are left out."""
+    spectrum = state.expected_power.copy()
+    for row, axis in enumerate(state.axes):
+        places = (("power", axis), ("added_power", axis))  # as in `State.power_columns`
+        dropped = np.array([flag for at in places for flag in is_left_out.get(at, [])], np.bool_)
+        if dropped.any():
+            spectrum[row] = fit_powers(state, axis, dropped)
+    return spectrum
+
+
+def _fit_means(
+    state: State,
+    empty_state: State,
+    known_mean: Floats,
+    is_left_out: Mapping[tuple[str, str], list[bool]],
+) -> Floats:
+    """Add to the known means (axis, block) the fit of the columns that are not left out."""
+    mean = known_mean.copy()
+    for row, axis in enumerate(state.axes):
+        columns = state.given.get(("mean", axis), [])
+        is_kept = ~np.array(is_left_out.get(("mean", axis), []), np.bool_)
+        if is_kept.any():
+            size, _ = mean_mixture(empty_state, axis, columns).moments()
+            mean[row] += np.tensordot(size[is_kept], np.stack(columns)[is_kept], axes=1)
+    return mean
 
 
 def _cross_spectra(components: Sequence[Component], state: State) -> Complexes:

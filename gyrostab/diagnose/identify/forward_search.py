@@ -199,17 +199,7 @@ def _select_next(
         key: examination.required_nats(effect_components, chosen)
         for key, effect_components in components.items()
     }
-    for key, effect_components in list(components.items()):
-        if not is_nuisance(key) and sum_evidence(effect_components) > required[key]:
-            components[key], better_form = keep_physical(
-                effect_components, state, error=required[key] - examination.threshold
-            )
-            if better_form:
-                beaten[key] = better_form
-            else:
-                beaten.pop(key, None)
-                # without the axes of impossible sizes
-                required[key] = examination.required_nats(components[key], chosen)
+    _leave_out_impossible(components, required, examination, state, chosen, beaten)
     passing = order_passing(components, required, state, examination)
     if not passing:
         return None
@@ -246,6 +236,30 @@ def _select_next(
     return [
         make_selection(components[alternative], required[alternative], alternatives=nearest)
     ], {}
+
+
+def _leave_out_impossible(
+    components: dict[str, list[Component]],
+    required: dict[str, float],
+    examination: Examination,
+    state: State,
+    chosen: Sequence[Selection],
+    beaten: dict[str, tuple[str, float]],
+) -> None:
+    """Leave out the axes on which an effect would have an impossible size, where it would pass.
+
+    `components` and `required` are changed; effects that another form beats are added to `beaten`.
+    """
+    for key, effect_components in list(components.items()):
+        if not is_nuisance(key) and sum_evidence(effect_components) > required[key]:
+            components[key], better_form = keep_physical(
+                effect_components, state, error=required[key] - examination.threshold
+            )
+            if better_form:
+                beaten[key] = better_form
+            else:
+                beaten.pop(key, None)
+                required[key] = examination.required_nats(components[key], chosen)
 
 
 def _find_shifted(

@@ -75,9 +75,7 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
         case.where(has_data).mean("block").values
         for case in (blocks["power"], before["spectrum"], after["spectrum"])
     ]
-    step = -(-blocks.sizes["line"] // MAX_LINES)
-    lines = blocks["line_power"].weighted(blocks["line_weight"].fillna(0.0)).mean("part")
-    highest = lines.coarsen(line=step, boundary="trim").max()
+    highest, resolution = _highest_lines(blocks)
     arrays: dict[str, Any] = {
         "avar": np.stack(np.broadcast_arrays(*avar)),
         "avar_low": np.stack(np.broadcast_arrays(*low)),
@@ -104,9 +102,19 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
         },
         attrs={name: blocks.attrs[name] for name in _ATTRIBUTES if name in blocks.attrs},
     ).assign(block_mean=blocks["mean"].variable)
-    resolution = f", highest of {step} lines" if step > 1 else " at full resolution"
     out["line_density"].attrs["long_name"] += resolution
     return out.set_coords(["time", "begin", "end", "tau"])
+
+
+def _highest_lines(blocks: xr.Dataset) -> tuple[xr.DataArray, str]:
+    """Average the line spectra, and keep the highest of neighbouring lines where there are many.
+
+    Also return of how many, for the label.
+    """
+    step = -(-blocks.sizes["line"] // MAX_LINES)
+    lines = blocks["line_power"].weighted(blocks["line_weight"].fillna(0.0)).mean("part")
+    highest = lines.coarsen(line=step, boundary="trim").max()
+    return highest, f", highest of {step} lines" if step > 1 else " at full resolution"
 
 
 def _make_windows(block_count: int) -> BlockWindows:

@@ -42,6 +42,7 @@ from gyrostab.diagnose.statistics.base import Region
 from gyrostab.diagnose.statistics.mismatch_wording import axes_text
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 from gyrostab.noise import LAWS
+from gyrostab.physics.base import Effect
 from gyrostab.physics.sampling import FAST_INSTRUMENT_SAMPLES, LoggerFilter
 from gyrostab.simulate.model import Model
 from gyrostab.wording import join_words
@@ -194,13 +195,7 @@ def model_tables(
 
     `own` is the model that was given, `turning` the axis that feels the channel ``rotation_rate``.
     """
-    noise = {
-        str(axis): {
-            str(term): float(f"{float(baseline['coefficient'].sel(axis=axis, term=term)):.6g}")
-            for term in baseline["term"].values
-        }
-        for axis in baseline["axis"].values
-    }
+    noise = _noise_tables(baseline)
     given_effects = list(own.effects) if own is not None else []
     given_oversampling = int(own.log.get("oversampling", 1)) if own is not None else 1
     added_effects = [
@@ -208,16 +203,7 @@ def model_tables(
     ]
     if baseline.attrs.get("source") == "calibrated":
         noise = undo_noise_loss(noise, blocks, added_effects)
-    instrument = max(
-        [
-            given_oversampling,
-            # a filter runs at the rate of the instrument
-            *(
-                int(getattr(effect, "instrument", 1)) or FAST_INSTRUMENT_SAMPLES
-                for effect in added_effects
-            ),
-        ]
-    )
+    instrument = _needed_oversampling(given_oversampling, added_effects)
     if instrument > given_oversampling:
         given_effects = [
             effect.at_oversampling(given_oversampling)
@@ -249,6 +235,24 @@ def model_tables(
         for axis, size in fit_white_noise(tables, baseline, clean, with_power).items():
             tables["noise"][axis]["N"] = float(f"{size:.6g}")
     return tables
+
+
+def _noise_tables(baseline: xr.Dataset) -> dict[str, dict[str, float]]:
+    """Return the noise coefficients of each axis, rounded as the model gives them."""
+    return {
+        str(axis): {
+            str(term): float(f"{float(baseline['coefficient'].sel(axis=axis, term=term)):.6g}")
+            for term in baseline["term"].values
+        }
+        for axis in baseline["axis"].values
+    }
+
+
+def _needed_oversampling(given: int, effects: Sequence[Effect]) -> int:
+    """Return the samples of the instrument in one of the log, with these effects in the model."""
+    # a filter runs at the rate of the instrument
+    samples = (int(getattr(effect, "instrument", 1)) for effect in effects)
+    return max([given, *(number or FAST_INSTRUMENT_SAMPLES for number in samples)])
 
 
 def _make_mismatch(
