@@ -370,6 +370,26 @@ def _read_profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[st
         if key not in _GIVEN
     }
     values = {key: value for key, value in table.items() if key != "profile"}
+    _check_arguments(str(name), values, arguments, where)
+    converted = {
+        key: amount(value, units[key], f"{where}: {key}") if key in units else value
+        for key, value in values.items()
+    }
+    for key, unit in units.items():
+        number = converted.get(key, 0.0)
+        if key != "band" and not (is_model_number(number) and math.isfinite(number)):
+            raise OptionError(f"{where}: {key} = {number!r} is not a number; give one in {unit}")
+    return str(name), converted
+
+
+def _check_arguments(
+    name: str,
+    values: Mapping[str, Any],
+    arguments: Mapping[str, inspect.Parameter],
+    where: str,
+) -> None:
+    """Raise `OptionError` for parameters that are unknown, missing, or of a wrong type."""
+    units = PROFILES[name][1]
     for key in values:
         if key not in arguments:
             listed = ", ".join(
@@ -383,7 +403,7 @@ def _read_profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[st
         if item.default is inspect.Parameter.empty and key not in values:
             raise OptionError(
                 f"{where}: profile {name!r} lacks {key!r}; "
-                f"see {function.__module__}.{name} for its parameters"
+                f"see {PROFILES[name][0].__module__}.{name} for its parameters"
             )
     for key, value in values.items():
         kind, expected = (
@@ -397,12 +417,3 @@ def _read_profile(table: Mapping[str, Any], where: str) -> tuple[str, Mapping[st
         )
         if not isinstance(value, kind) or value == "":
             raise OptionError(f"{where}: {key} = {value!r} is not {expected or 'a value'}")
-    converted = {
-        key: amount(value, units[key], f"{where}: {key}") if key in units else value
-        for key, value in values.items()
-    }
-    for key, unit in units.items():
-        number = converted.get(key, 0.0)
-        if key != "band" and not (is_model_number(number) and math.isfinite(number)):
-            raise OptionError(f"{where}: {key} = {number!r} is not a number; give one in {unit}")
-    return str(name), converted
