@@ -279,34 +279,12 @@ def _find_free_bands(state: State, axis: str) -> Bools:
 
 def _axis_record(state: State, axis: str) -> _AxisRecord | None:
     """Collect the means and powers of an axis, averaged over blocks of similar power."""
-    blocks, baseline, row = state.blocks, state.baseline, state.axes.index(axis)
-    power, shape = blocks["power"].values[row], reduced_shape(blocks)[row]
-    power = np.where(_find_free_bands(state, axis), np.nan, power)
-    chosen = ~state.masked[row] & (np.isfinite(power) & np.isfinite(shape)).any(axis=1)
+    blocks, baseline = state.blocks, state.baseline
     values = mean_residual(blocks, baseline, axis)
     present = np.isfinite(values[:, 0])
-    if chosen.sum() < MIN_BLOCKS or present.sum() < MIN_BLOCKS:
+    bands = _average_bands(state, axis)
+    if bands is None or present.sum() < MIN_BLOCKS:
         return None
-    band_count = blocks.sizes["band"]
-    columns, fixed_power = axis_values(baseline, "columns", axis), _power_of_effects(state, axis)
-    cells = np.stack(
-        [
-            *columns.transpose(2, 0, 1),
-            np.broadcast_to(np.arange(band_count, dtype=np.float64), power.shape),
-            np.broadcast_to(unspread_share(blocks)[row][:, None], power.shape),
-            fixed_power,
-        ],
-        axis=-1,
-    )
-    varies = np.ptp(fixed_power[chosen], axis=0).max() > _MIN_CHANGE * np.nanmin(power[chosen])
-    bands = average_groups(
-        power,
-        shape,
-        np.nan_to_num(cells),
-        state.expected_power[row].mean(axis=1),
-        chosen,
-        _SEARCH_GROUPS if varies else 1,
-    )
     columns = bands.columns
     bands = BandPowers(bands.power, columns[:, :4], bands.weight)
     square = with_floor(fit_squares(bands)[0], bands)
@@ -341,4 +319,38 @@ def _axis_record(state: State, axis: str) -> _AxisRecord | None:
         means,
         ends,
         CubicSpline(log_times, np.log(powers)),
+    )
+
+
+def _average_bands(state: State, axis: str) -> BandPowers | None:
+    """Average powers and columns of an axis over blocks of similar power; None if they are few.
+
+    The columns are those of the noise, the number of the band, the share that is not spread, and
+    the power of effects.
+    """
+    blocks, baseline, row = state.blocks, state.baseline, state.axes.index(axis)
+    power, shape = blocks["power"].values[row], reduced_shape(blocks)[row]
+    power = np.where(_find_free_bands(state, axis), np.nan, power)
+    chosen = ~state.masked[row] & (np.isfinite(power) & np.isfinite(shape)).any(axis=1)
+    if chosen.sum() < MIN_BLOCKS:
+        return None
+    band_count = blocks.sizes["band"]
+    columns, fixed_power = axis_values(baseline, "columns", axis), _power_of_effects(state, axis)
+    cells = np.stack(
+        [
+            *columns.transpose(2, 0, 1),
+            np.broadcast_to(np.arange(band_count, dtype=np.float64), power.shape),
+            np.broadcast_to(unspread_share(blocks)[row][:, None], power.shape),
+            fixed_power,
+        ],
+        axis=-1,
+    )
+    varies = np.ptp(fixed_power[chosen], axis=0).max() > _MIN_CHANGE * np.nanmin(power[chosen])
+    return average_groups(
+        power,
+        shape,
+        np.nan_to_num(cells),
+        state.expected_power[row].mean(axis=1),
+        chosen,
+        _SEARCH_GROUPS if varies else 1,
     )

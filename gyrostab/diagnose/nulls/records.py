@@ -223,27 +223,8 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
     squares, slow = (
         baseline[name].values[np.arange(axes), chosen] for name in ("posterior", "posterior_slow")
     )
-    expected = np.einsum("abfn,ran->rabf", baseline["columns"].values, squares) * setup.effect_ratio
-    if "form_shape" in baseline:  # the form of the spectrum was measured on a simulated log
-        form = baseline["form_shape"].values
-        expected *= _draw_gamma(form, np.ones((count, *form.shape)), rng)[:, :, None]
-    coherency: Complexes | None = None
-    if setup.shared is None:
-        power = _draw_gamma(baseline["shape_alone"].values, expected, rng, setup.ties)
-    else:
-        power, coherency = _draw_shared_spectra(setup.shared, count, rng)
-        power *= expected
-        if "cross_error" in baseline:
-            error = baseline["cross_error"].values
-            coherency += (
-                error * (rng.standard_normal((count, *error.shape, 2)) @ np.array([1.0, 1j]))
-            )[:, :, None]
-    common = baseline["common"].values
-    common_shape = np.full(common.shape, np.inf)
-    np.divide(1.0, common, out=common_shape, where=common > 0.0)
-    common_factor = _draw_gamma(common_shape, np.ones(power.shape[:3]), rng)[..., None]
-    power *= common_factor
-    power[..., np.isnan(blocks["power"].values)] = np.nan
+    expected = _expect_power(setup, squares, rng)
+    power, cross_power, coherency = _draw_powers(setup, expected, rng)
     variables: dict[str, Any] = {
         "mean": (("axis", "block"), _draw_means(setup, squares, slow, rng)),
         "power": (("axis", "block", "band"), power),
@@ -251,9 +232,7 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
         "kurtosis": (("axis", "block"), _draw_kurtosis(setup, count, rng)),
         "cross": (
             ("pair", "block", "band"),
-            _draw_cross(
-                setup, power if coherency is None else expected * common_factor, coherency, rng
-            ),
+            _draw_cross(setup, cross_power, coherency, rng),
         ),
     }
     draw = NullDraw(blocks, baseline, count, rng, expected, power, setup.sample_sd)
@@ -271,6 +250,45 @@ def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr
             for name, (dims, values) in variables.items()
         }
     )
+
+
+def _expect_power(setup: _NullSetup, squares: Floats, rng: np.random.Generator) -> Floats:
+    """Return the expected powers (record, axis, block, band) of noise with these squares."""
+    baseline = setup.baseline
+    noise = np.einsum("abfn,ran->rabf", baseline["columns"].values, squares)
+    expected: Floats = noise * setup.effect_ratio
+    if "form_shape" in baseline:  # the form of the spectrum was measured on a simulated log
+        form = baseline["form_shape"].values
+        expected *= _draw_gamma(form, np.ones((len(squares), *form.shape)), rng)[:, :, None]
+    return expected
+
+
+def _draw_powers(
+    setup: _NullSetup, expected: Floats, rng: np.random.Generator
+) -> tuple[Floats, Floats, Complexes | None]:
+    """Draw band powers; also return the powers and the coherency that cross-spectra have.
+
+    The coherency is None where axes share no noise.
+    """
+    baseline, count = setup.baseline, len(expected)
+    coherency: Complexes | None = None
+    if setup.shared is None:
+        power = _draw_gamma(baseline["shape_alone"].values, expected, rng, setup.ties)
+    else:
+        power, coherency = _draw_shared_spectra(setup.shared, count, rng)
+        power *= expected
+        if "cross_error" in baseline:
+            error = baseline["cross_error"].values
+            coherency += (
+                error * (rng.standard_normal((count, *error.shape, 2)) @ np.array([1.0, 1j]))
+            )[:, :, None]
+    common = baseline["common"].values
+    common_shape = np.full(common.shape, np.inf)
+    np.divide(1.0, common, out=common_shape, where=common > 0.0)
+    common_factor = _draw_gamma(common_shape, np.ones(power.shape[:3]), rng)[..., None]
+    power *= common_factor
+    power[..., np.isnan(setup.blocks["power"].values)] = np.nan
+    return power, power if coherency is None else expected * common_factor, coherency
 
 
 def _draw_gamma(

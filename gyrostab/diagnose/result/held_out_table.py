@@ -95,13 +95,7 @@ def measure_held_out(
     after = partial(train, judged) if judged.identified else before
     with_phase_locked = partial(train, with_course) if identified else before
     training = select_forecast_start(blocks)
-    begun = tuple(
-        identification
-        for identification in judged.identified
-        if active_blocks(identification, blocks, settings=settings)[training].any()
-    )
-    # what is over later is not forecast, but is in the blocks that the noise is calibrated on
-    is_over = [not _can_be_forecast(identification, blocks, settings) for identification in begun]
+    begun, is_over = _list_begun(judged.identified, blocks, training, settings)
     has_forecast = not all(is_over)
     evidence = held_out(
         clean,
@@ -116,6 +110,23 @@ def measure_held_out(
     if not has_forecast:
         evidence["forecast_gain"] = np.nan  # no effect can be forecast
     return evidence
+
+
+def _list_begun(
+    identified: Sequence[Selection], blocks: xr.Dataset, training: Bools, settings: Settings
+) -> tuple[tuple[Selection, ...], list[bool]]:
+    """List the effects that act in the training blocks, and which of them are not forecast.
+
+    What is over later is not forecast, but is in the blocks that the noise is calibrated on.
+    """
+    begun = tuple(
+        identification
+        for identification in identified
+        if active_blocks(identification, blocks, settings=settings)[training].any()
+    )
+    return begun, [
+        not _can_be_forecast(identification, blocks, settings) for identification in begun
+    ]
 
 
 def _remove_random_biases(identifications: Identifications) -> tuple[Identifications, float]:
