@@ -19,7 +19,7 @@ from page import make_parser, table
 
 from gyrostab.arrays import Floats
 from gyrostab.blindtest.generator.detection_limits import NATS, learned_nats
-from gyrostab.diagnose.baseline.calibrate import grid_values
+from gyrostab.diagnose.baseline.assemble import grid_values
 from gyrostab.diagnose.baseline.posterior import visible_coefficients
 from gyrostab.diagnose.evidence.folds import FOLDS
 from gyrostab.diagnose.evidence.held_out import mean_factors

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Floats
-from gyrostab.diagnose.baseline.calibrate import assemble_baseline
+from gyrostab.diagnose.baseline.assemble import assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import NOISE, line_columns, reduced_shape
 from gyrostab.diagnose.baseline.known_effects import expect_known_effects
 from gyrostab.diagnose.baseline.known_lines import independent_line_share

@@ -10,8 +10,10 @@ from scipy.ndimage import binary_dilation
 from scipy.special import chdtrc
 
 from gyrostab.arrays import Array, Bools, Floats
-from gyrostab.diagnose.baseline.calibrate import MIN_BANDS, assemble_baseline, calibrate_axes
+from gyrostab.diagnose.baseline.assemble import assemble_baseline
+from gyrostab.diagnose.baseline.calibrate import calibrate_axes
 from gyrostab.diagnose.baseline.expected_statistics import noise_powers, sum_noise
+from gyrostab.diagnose.baseline.foreign_bands import MIN_BANDS
 from gyrostab.diagnose.baseline.from_model import scale_to_quiescent
 from gyrostab.diagnose.baseline.posterior import Posterior
 from gyrostab.diagnose.baseline.quiescent import (

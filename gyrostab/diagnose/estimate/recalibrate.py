@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Bools, Floats
-from gyrostab.diagnose.baseline.calibrate import MIN_MEAN_NOISE_FACTOR, assemble_baseline
+from gyrostab.diagnose.baseline.assemble import MIN_MEAN_NOISE_FACTOR, assemble_baseline
 from gyrostab.diagnose.baseline.expected_statistics import (
     N_TERM,
     NOISE,

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from gyrostab.diagnose.baseline.calibrate import assemble_baseline, calibrate_axes, calibrate_noise
+from gyrostab.diagnose.baseline.assemble import assemble_baseline
+from gyrostab.diagnose.baseline.calibrate import calibrate_axes, calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.constant_rate import fit_white_noise
