@@ -9,7 +9,7 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.estimate.joint_fit import fit_identifications, split_steps
+from gyrostab.diagnose.estimate.joint_fit import fit_identifications
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.identifiability import find_equivalent_effects, keep_physical
@@ -126,40 +126,6 @@ def test_scatter_on_one_axis_is_no_jump_beside_that_of_another_axis() -> None:
     assert {component.row for component in components} == {("x",), ("y",)}
     kept, _ = keep_physical(components, state)
     assert [(part.row, part.variant.values["at"]) for part in kept] == [(("y",), 1300.0)]
-
-
-def test_steps_of_other_axes_do_not_limit_the_times_of_a_step() -> None:
-    """Axis y has steps at two instants; that of x at the second one belongs to the first group."""
-    second = np.arange(9_000) / 5.0
-    rate = np.random.default_rng(1).standard_normal((2, second.size))
-    blocks = reduce_log(make_log(rate, rate=5.0, unit="deg/h"))
-    jumps, state = try_jumps(blocks, baseline_from_model(blocks, MODEL))
-    at = {variant.values["at"]: variant for variant in jumps.variants}
-    first, then = sorted(at)[len(at) // 2 :][:2]
-    steps = [
-        Component(jumps, at[time], (axis,), 20.0)
-        for axis, time in (("y", first), ("x", then), ("y", then))
-    ]
-    parts = split_steps(steps, state)
-    assert [[step.row for step in part] for part, _ in parts] == [[("y",), ("x",)], [("y",)]]
-    for part, _ in parts:
-        assert all(step.candidate.variants for step in part)
-
-
-def test_steps_of_one_axis_at_one_time_are_one() -> None:
-    """Jumps that were selected one after another may be set to the same time."""
-    second = np.arange(9_000) / 5.0
-    rate = np.random.default_rng(1).standard_normal((1, second.size))
-    blocks = reduce_log(make_log(rate, rate=5.0, unit="deg/h"))
-    jumps, state = try_jumps(blocks, baseline_from_model(blocks, MODEL))
-    early, late = (jumps.variants[place] for place in (20, 60))
-    steps = [
-        Component(jumps, variant, ("x",), nats)
-        for variant, nats in ((late, 9.0), (early, 20.0), (late, 7.0))
-    ]
-    parts = split_steps(steps, state)
-    assert [[step.evidence_nats for step in part] for part, _ in parts] == [[20.0], [9.0]]
-    assert all(step.candidate.variants for part, _ in parts for step in part)
 
 
 def test_jump_at_a_restart_may_settle() -> None:
