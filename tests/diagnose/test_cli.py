@@ -15,7 +15,7 @@ import gyrostab
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.nulls.scores import fit_best_evidence
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
-from gyrostab.diagnose.result.attribution import join_blocks
+from gyrostab.diagnose.result.active_spans import join_blocks
 from gyrostab.diagnose.result.content import check_diagnosis
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic

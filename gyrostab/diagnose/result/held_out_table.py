@@ -25,7 +25,7 @@ from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.identify.selections import Selection, components_of
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.reduce.schema import pair_indices
-from gyrostab.diagnose.result.attribution import active_blocks
+from gyrostab.diagnose.result.active_spans import active_blocks
 from gyrostab.diagnose.settings import Settings
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks

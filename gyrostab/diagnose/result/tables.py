@@ -23,7 +23,7 @@ from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
 from gyrostab.diagnose.predict.candidates import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.predict.windows import channel_units, make_windows
 from gyrostab.diagnose.reduce.schema import format_time, read_as_measured
-from gyrostab.diagnose.result.attribution import active_blocks, join_blocks
+from gyrostab.diagnose.result.active_spans import active_blocks, join_blocks
 from gyrostab.diagnose.result.diagnosis import tabulate_effect
 from gyrostab.diagnose.result.families import find_families
 from gyrostab.diagnose.result.text import (
