@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -11,19 +11,18 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyrostab.arrays import Floats, Ints
 from gyrostab.errors import FormatError, OptionError, TimeError
 from gyrostab.ingest.columns.pieces import CHUNK_ROWS, Spool
 from gyrostab.ingest.columns.stamps import CLOCK_PERIODS, NAT, find_turns, read_stamps, typical_step
 from gyrostab.ingest.concat.core import absence_notes, check_kinds, merge_notes, unify_units
 from gyrostab.ingest.concat.grid import group_axes, split_axes
-from gyrostab.ingest.concat.place import COMPARED_SAMPLES, match_ends
+from gyrostab.ingest.raw_rows import first_known_stamp, list_axes, stamp_span
+from gyrostab.ingest.repeats import drop_repeats
 from gyrostab.schema import SIGNAL_UNITS, texts
 from gyrostab.store.lazy import (
     concatenate_columns,
     convert_values,
     make_dask,
-    read_slice,
     select_part,
     stack_rows,
 )
@@ -32,7 +31,7 @@ from gyrostab.wording import list_some
 
 #: Largest distance of first stamps from the zero of their clock [lengths of the shortest file].
 _MAX_BEGIN = 0.1
-_BLOCK_ROWS, _FIRST_ROWS = 2**20, 2**12
+_FIRST_ROWS = 2**12
 #: Advice where units of a channel do not convert to each other.
 _ADVICE = (
     'if a header is wrong, give the unit of all with --map "{0}={0} [UNIT]", otherwise drop the '
@@ -137,8 +136,8 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
 
 def _group_by_axes(parts: list[xr.Dataset]) -> list[list[xr.Dataset]]:
     """Group files by their axes if the groups cover the same time; otherwise all form one group."""
-    groups = group_axes(parts, map(_axis_names, parts))
-    if len(groups) == 1 or not all(_axis_names(group[0]) for group in groups):
+    groups = group_axes(parts, map(list_axes, parts))
+    if len(groups) == 1 or not all(list_axes(group[0]) for group in groups):
         return [list(parts)]
     if "time" not in parts[0].variables:
         return groups
@@ -149,10 +148,6 @@ def _group_by_axes(parts: list[xr.Dataset]) -> list[list[xr.Dataset]]:
     # whether a group begins after another one has ended
     is_later = any(later[0] > earlier[1] for earlier, later in pairwise(sorted(spans)))
     return [list(parts)] if is_later else groups
-
-
-def _axis_names(part: xr.Dataset) -> list[str]:
-    return [str(axis) for axis in part["axis"].values] if "axis" in part.coords else []
 
 
 def _slow_channels(part: xr.Dataset) -> list[str]:
@@ -251,14 +246,14 @@ def _concatenate_parts(
     if len(groups) > 1:
         joined.attrs["axis_rows"], end = [], 0
         for group in groups:
-            axes = sorted({axis for part in group for axis in _axis_names(part)})
+            axes = sorted({axis for part in group for axis in list_axes(part)})
             begin, end = end, end + sum(part.sizes["row"] for part in group)
             joined.attrs["axis_rows"].append([axes, begin, end])
     return joined
 
 
 def _axis_column(part: xr.Dataset, signal: str, axis: str) -> Any | None:
-    names = _axis_names(part)
+    names = list_axes(part)
     return select_part(part[signal].data, names.index(axis)) if axis in names else None
 
 
@@ -331,130 +326,6 @@ def _filled_rows(source: xr.Dataset, channel: str) -> pd.DataFrame:
     stamps, values = (source[name].values for name in (_clock_of(source, channel), channel))
     is_filled = np.isfinite(values) & ~np.isnat(stamps)
     return pd.DataFrame({"stamp": stamps[is_filled], "value": values[is_filled]})
-
-
-def drop_repeats(
-    parts: Sequence[xr.Dataset], signal: str
-) -> tuple[list[xr.Dataset], list[xr.Dataset]]:
-    """Drop the rows of each file that repeat rows of other files, with notes.
-
-    Two files overlap if rows of both have the same stamps and the same values. Files whose clocks
-    merely cover the same hours, for instance after a restart of the clock, differ and stay
-    unchanged. `parts` are in the order of their first stamps. A file without new rows is dropped as
-    a whole. The notes are in the file that contains the rows.
-
-    Rows are dropped from a file whose axes and channels the other has too. Where neither has all,
-    the later file is returned in the second list.
-    """
-    kept_parts: list[tuple[xr.Dataset, int]] = []  # with the latest stamp of each
-    parts_apart: list[xr.Dataset] = []
-    for part in parts:
-        first, end = stamp_span(part)
-        is_apart = False
-        for place, (held, held_end) in reversed(list(enumerate(kept_parts))):
-            if first > held_end:
-                continue
-            tail, head = _rows_from(held, first), _rows_until(part, held_end)
-            if not _is_copy(held, part, signal, tail, head):
-                continue
-            ours, theirs = ({*_axis_names(log), *log.data_vars} for log in (held, part))
-            size = held.sizes["row"]
-            cells = _count_filled(held, signal, tail, size), _count_filled(part, signal, 0, head)
-            is_fuller = cells[1] > cells[0] and head >= size - tail
-            if is_fuller and theirs >= ours and end >= held_end:
-                # it contains cells that the earlier file lost
-                held, part = _drop_rows(held, slice(0, tail), part)
-                held_end = first - 1
-            elif theirs <= ours:
-                part, held = _drop_rows(part, slice(head, None), held)
-                first, end = stamp_span(part)
-            else:
-                is_apart = True
-                break
-            kept_parts[place] = held, held_end
-        if is_apart:
-            parts_apart.append(part)
-        else:
-            kept_parts.append((part, end))
-        kept_parts = [(log, last) for log, last in kept_parts if log.sizes["row"]]
-    return [log for log, _ in kept_parts], parts_apart
-
-
-def _count_filled(part: xr.Dataset, signal: str, begin: int, end: int) -> int:
-    """Count the filled cells of some rows; those of the signal are read if some are unreadable."""
-    count = (end - begin) * len({*_axis_names(part), *part.data_vars})
-    if part.attrs["unreadable_rows"] or part.attrs["unreadable_cells"]:
-        for start in range(begin, end, _BLOCK_ROWS):
-            block = read_slice(part[signal].data, start, min(start + _BLOCK_ROWS, end))
-            count -= int(np.count_nonzero(np.isnan(block)))
-    return count
-
-
-def _drop_rows(part: xr.Dataset, rows: slice, other: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
-    """Keep the given rows of `part`; add a note on the others to `other`, which contains them."""
-    name, holder = (str(log.attrs["source_files"][0]) for log in (part, other))
-    shorter = part.isel(row=rows)
-    left_out = part.sizes["row"] - shorter.sizes["row"]
-    note = f"{holder}: {left_out} rows of {name} are here too, and are left out there"
-    return shorter, other.assign_attrs(notes=[*other.attrs["notes"], note])
-
-
-def _stamp_blocks(part: xr.Dataset) -> Iterator[tuple[int, Ints]]:
-    """Yield the stamps of a raw log [ns since 1970] in blocks, with the first row of each."""
-    for begin in range(0, part.sizes["row"], _BLOCK_ROWS):
-        yield begin, read_stamps(part, begin, begin + _BLOCK_ROWS)
-
-
-def first_known_stamp(part: xr.Dataset) -> int:
-    """Return the first stamp of a raw log [ns since 1970]; the largest integer without any."""
-    known = (stamps[stamps != NAT] for _, stamps in _stamp_blocks(part))
-    return next((int(stamps[0]) for stamps in known if stamps.size), int(np.iinfo(np.int64).max))
-
-
-def stamp_span(part: xr.Dataset) -> tuple[int, int]:
-    """Return the first and the latest stamp of a raw log [ns since 1970]."""
-    latest = max((int(stamps.max()) for _, stamps in _stamp_blocks(part)), default=NAT)
-    return first_known_stamp(part), latest  # NAT is the smallest integer
-
-
-def _rows_from(part: xr.Dataset, first: int) -> int:
-    """Return the row from which all stamps are `first` or later."""
-    early = (
-        (begin, np.flatnonzero((stamps < first) & (stamps != NAT)))
-        for begin, stamps in _stamp_blocks(part)
-    )
-    return max((begin + int(rows[-1]) + 1 for begin, rows in early if rows.size), default=0)
-
-
-def _rows_until(part: xr.Dataset, last: int) -> int:
-    """Return the number of rows before the first stamp later than `last`."""
-    late = ((begin, np.flatnonzero(stamps > last)) for begin, stamps in _stamp_blocks(part))
-    return next((begin + int(rows[0]) for begin, rows in late if rows.size), part.sizes["row"])
-
-
-def _is_copy(held: xr.Dataset, part: xr.Dataset, signal: str, tail: int, head: int) -> bool:
-    """Return whether the first `head` rows of `part` repeat those of `held` from `tail` on."""
-    most, size = COMPARED_SAMPLES, held.sizes["row"]
-    ends = [
-        ((tail, tail + most), (0, min(head, most))),
-        ((max(tail, size - most), size), (max(0, head - most), head)),
-    ]
-    return match_ends(_read_common((held, part), signal, spans) for spans in ends).alike
-
-
-def _read_common(
-    parts: tuple[xr.Dataset, xr.Dataset], signal: str, spans: Sequence[tuple[int, int]]
-) -> tuple[Floats, Floats]:
-    """Read the signal (axis, row) of two files on their common axes at their common stamps."""
-    ours, theirs = (read_stamps(part, *span) for part, span in zip(parts, spans, strict=True))
-    stamps, *rows = np.intersect1d(ours, theirs, return_indices=True)
-    our_axes, their_axes = (part["axis"].values for part in parts)
-    _, *axes = np.intersect1d(our_axes, their_axes, return_indices=True)
-    held, new = (
-        read_slice(part[signal].data, *span)[axis][:, row[stamps != NAT]]
-        for part, span, axis, row in zip(parts, spans, axes, rows, strict=True)
-    )
-    return held, new
 
 
 def warn_notes(log: xr.Dataset) -> None:

@@ -18,13 +18,13 @@ from gyrostab.ingest.combine import (
     continue_clocks,
     memory_bytes,
     move_to_disk,
-    stamp_span,
     warn_notes,
 )
 from gyrostab.ingest.concat.core import concatenate_logs
 from gyrostab.ingest.concat.grid import log_span
 from gyrostab.ingest.files import expand, name_key, read_file, scan_file
 from gyrostab.ingest.options import ReadOptions
+from gyrostab.ingest.raw_rows import stamp_span
 from gyrostab.ingest.uniform import check_same_rate
 from gyrostab.schema import texts
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
