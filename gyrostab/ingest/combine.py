@@ -244,12 +244,19 @@ def _concatenate_parts(
         unreadable_cells=sum(part.attrs["unreadable_cells"] for part in parts),
     )
     if len(groups) > 1:
-        joined.attrs["axis_rows"], end = [], 0
-        for group in groups:
-            axes = sorted({axis for part in group for axis in list_axes(part)})
-            begin, end = end, end + sum(part.sizes["row"] for part in group)
-            joined.attrs["axis_rows"].append([axes, begin, end])
+        joined.attrs["axis_rows"] = _list_axis_rows(groups)
     return joined
+
+
+def _list_axis_rows(groups: list[list[xr.Dataset]]) -> list[list[Any]]:
+    """List the axes of each group of files, its first row, and the row after its last."""
+    axis_rows: list[list[Any]] = []
+    end = 0
+    for group in groups:
+        axes = sorted({axis for part in group for axis in list_axes(part)})
+        begin, end = end, end + sum(part.sizes["row"] for part in group)
+        axis_rows.append([axes, begin, end])
+    return axis_rows
 
 
 def _axis_column(part: xr.Dataset, signal: str, axis: str) -> Any | None:

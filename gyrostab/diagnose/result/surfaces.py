@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from scipy.special import gammaincinv
 
-from gyrostab.arrays import Floats
+from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.reduce.schema import Variable, label_variables
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.mean import window_means
@@ -56,18 +56,9 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
     mean = [_average_windows(blocks, blocks["mean"].values, windows)]
     error = [np.full(mean[0].shape, np.nan)]
     for baseline in (before, after):
-        noise = allan_surface(blocks, baseline, windows)
-        shape = noise["shape"][..., keep]
-        expected = noise["expected"][..., keep]
-        with np.errstate(invalid="ignore"):
-            avar.append(expected + _known_avar(blocks, baseline, windows)[..., keep])
-            # what the known mean adds to the Allan variance of this noise
-            shift = (recorded["observed"] - noise["observed"])[..., keep]
-            low.append(expected * gammaincinv(shape, 0.025) / shape + shift)
-            high.append(expected * gammaincinv(shape, 0.975) / shape + shift)
-            information = window_means(blocks, baseline, windows)[1]
-            error.append(1.0 / np.sqrt(information))
-        mean.append(_predicted_means(blocks, baseline, windows))
+        case = _simulate_case(blocks, baseline, windows, recorded["observed"], keep)
+        for values, added in zip((avar, low, high, mean, error), case, strict=True):
+            values.append(added)
     begin, end = blocks["begin"].values[windows.first], blocks["end"].values[windows.stop - 1]
     start = np.datetime64(int(blocks.attrs["start_ns"]), "ns")
     has_data = np.isfinite(blocks["power"])
@@ -104,6 +95,29 @@ def make_surfaces(blocks: xr.Dataset, before: xr.Dataset, after: xr.Dataset) -> 
     ).assign(block_mean=blocks["mean"].variable)
     out["line_density"].attrs["long_name"] += resolution
     return out.set_coords(["time", "begin", "end", "tau"])
+
+
+def _simulate_case(
+    blocks: xr.Dataset,
+    baseline: xr.Dataset,
+    windows: BlockWindows,
+    observed: Floats,
+    keep: Bools,
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Return the Allan variance of a simulation with its 95 % band, and means with their errors.
+
+    `observed` is the surface of the recording, of which `keep` are the columns of Allan variances.
+    """
+    noise = allan_surface(blocks, baseline, windows)
+    shape, expected = noise["shape"][..., keep], noise["expected"][..., keep]
+    with np.errstate(invalid="ignore"):
+        avar = expected + _known_avar(blocks, baseline, windows)[..., keep]
+        # what the known mean adds to the Allan variance of this noise
+        shift = (observed - noise["observed"])[..., keep]
+        low = expected * gammaincinv(shape, 0.025) / shape + shift
+        high = expected * gammaincinv(shape, 0.975) / shape + shift
+        error = 1.0 / np.sqrt(window_means(blocks, baseline, windows)[1])
+    return avar, low, high, _predicted_means(blocks, baseline, windows), error
 
 
 def _highest_lines(blocks: xr.Dataset) -> tuple[xr.DataArray, str]:

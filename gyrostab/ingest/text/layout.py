@@ -176,22 +176,12 @@ def find_layout(
             f"{path.name}: there is a header (line {content[0] + 1}) but no data row below it; "
             "copy it again"
         )
-    head_lines = [lines[index] for index in data[:HEAD_LINES]]
-    whole_rows = [header] if header else [split_line(line, separator) for line in head_lines]
-    width = _commonest_width(whole_rows)
-    rows = [tuple(_split_data(line, separator, width)) for line in head_lines]
-    paired = _find_pair(rows)
-    if paired is not None:
-        rows = [tuple(_join_pair(list(row), paired)) for row in rows]
+    rows, paired = _split_rows([lines[at] for at in data[:HEAD_LINES]], header, separator)
     width = _commonest_width(rows)
     if header is not None and paired is not None and len(header) > width:
         header = _join_headers(header, paired)
         units = {column - (column > paired): unit for column, unit in reversed(units.items())}
-    headers = list(header) if header is not None else [str(column) for column in range(width)]
-    if width == len(headers) + 1 and all(row[-1] == "" for row in rows if len(row) == width):
-        headers.append("")  # every data row ends with a separator
-    if width == len(headers) - 1 and headers[-1].lower() in _OPTIONAL_NAMES:
-        headers.pop()
+    headers = _fit_headers(header, rows, width)
     if separator == "," and width == len(headers) + 1:
         _check_seconds(path, rows[0], first + 1)
     if separator == BLANK and width != len(headers):
@@ -210,6 +200,34 @@ def find_layout(
         tuple(headers), separator, offset, first + 1, tuple(samples[:50]), marks, tuple(notes), top,
         paired, units, tuple(header_rows),
     )  # fmt: skip
+
+
+def _split_rows(
+    lines: Sequence[str], header: Sequence[str] | None, separator: str
+) -> tuple[list[tuple[str, ...]], int | None]:
+    """Split lines of data into rows, with date and time joined in one cell.
+
+    Also return the column of the date if date and time are in two.
+    """
+    whole_rows = [header] if header else [split_line(line, separator) for line in lines]
+    width = _commonest_width(whole_rows)
+    rows = [tuple(_split_data(line, separator, width)) for line in lines]
+    paired = _find_pair(rows)
+    if paired is not None:
+        rows = [tuple(_join_pair(list(row), paired)) for row in rows]
+    return rows, paired
+
+
+def _fit_headers(
+    header: Sequence[str] | None, rows: Sequence[Sequence[str]], width: int
+) -> list[str]:
+    """Return a header for every column of the rows, which have this width; numbers without any."""
+    headers = list(header) if header is not None else [str(column) for column in range(width)]
+    if width == len(headers) + 1 and all(row[-1] == "" for row in rows if len(row) == width):
+        headers.append("")  # every data row ends with a separator
+    if width == len(headers) - 1 and headers[-1].lower() in _OPTIONAL_NAMES:
+        headers.pop()
+    return headers
 
 
 def _decode_lines(path: Path, head: bytes, *, complete: bool) -> tuple[list[str], list[str]]:
