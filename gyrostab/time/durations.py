@@ -69,7 +69,8 @@ def duration_seconds(
             f"{option} {value!r} is not a duration; write for instance {example}"
         ) from error
     if not (np.isfinite(seconds) and (seconds > 0 or (zero and seconds == 0))):
-        raise OptionError(f"{option} {value!r} must be longer than zero")
+        least = "zero or longer" if zero else "longer than zero"
+        raise OptionError(f"{option} {value!r} must be {least}")
     return float(seconds)
 
 
