@@ -55,7 +55,7 @@ def confidence_interval(surface: xr.Dataset, *, level: float = 0.95) -> xr.Datas
     """
     surface = with_axis(surface)
     check_surface(surface)
-    if not (isinstance(level, int | float) and 0.0 < level < 1.0):
+    if not (isinstance(level, int | float | np.number) and 0.0 < level < 1.0):
         raise OptionError(f"level={level!r}: give a probability between 0 and 1, such as 0.95")
     limits = xr.apply_ufunc(
         interval_limits,

@@ -59,14 +59,16 @@ def davar(
     Parameters
     ----------
     log : xarray.Dataset
-        Regular log with ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree], NaN
-        where a sample is missing, numpy or dask, float or integer. A dask log stays lazy and gives
-        the same bits for any chunking. The sampling rate is that of ``time``: a log that was
-        thinned or averaged has its new rate, and dropped samples are missing. A DataArray with
+        Regular log with ``rate(axis, time)`` [degree hour-1] or ``angle(axis, time)`` [degree],
+        with dimensions in any order and NaN where a sample is missing, numpy or dask, float or
+        integer; other known units in its attribute ``units`` are converted. A dask log stays lazy
+        and gives the same bits for any chunking. The sampling rate is that of ``time``: a log that
+        was thinned or averaged has its new rate, and dropped samples are missing. A DataArray with
         ``attrs["units"]``, or a pandas table as for `gyrostab.from_dataframe`, is also accepted.
     window, step : str or timedelta
         Length and step of the window: a duration (``"10min"``), or a number of samples
-        (``"2000samples"``). A bare number is refused. `step` defaults to a tenth of the window.
+        (``"2000samples"``). A bare number is refused. `window` defaults to ten minutes, or less,
+        so that at least four windows fit into the record; `step` to a tenth of the window.
     taus : int, {"octave", "all"} or sequence
         Averaging times: a number of them, evenly spaced in log tau; powers of two samples; every
         one; or a list [s] (numbers, or strings such as ``"0.1s"``). Each is rounded to a whole
@@ -96,14 +98,18 @@ def davar(
         window_trend, trend_response, trend_quantization_response, trend_flicker_response,
         trend_walk_response, outlier_count, gap_edge_ratio (axis, time)``, and every
         channel of the log averaged over each window; ``time`` is the centre of the window, with
-        ``time_bounds``; ``tau`` [s]. Units are attributes of the variables.
+        ``time_bounds``; ``tau`` [s]. Units are attributes of the variables. Global attributes are
+        kept; coordinates of the log that are neither dimensions nor numbers on ``time`` are not.
 
     Raises
     ------
     OptionError
-        If window, step or taus do not fit the record or each other; the message says which would.
+        If window, step or taus do not fit the record or each other, with a message that says which
+        would, or if another option is invalid.
     SchemaError
         If `log` is not a regular log.
+    MissingUnitError, UnitError
+        If a DataArray or a table has no units, or no known ones.
     TimeError
         If its time is not in order, or not uniform.
 

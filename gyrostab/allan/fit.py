@@ -45,7 +45,8 @@ def fit_noise(
     Parameters
     ----------
     surface : xarray.Dataset
-        Surface of `gyrostab.davar`.
+        Surface of `gyrostab.davar`, or some of its axes, windows or averaging times; a lazy one
+        stays lazy, but for the search of a filter.
     terms : str or iterable of str
         Terms to fit, a selection of Q, N, B, K, R; the others are taken as zero.
     tau_min, tau_max : float or str, optional
@@ -77,7 +78,7 @@ def fit_noise(
     Raises
     ------
     OptionError
-        If a term is unknown.
+        If a term is unknown, or no averaging time lies between `tau_min` and `tau_max`.
     SchemaError
         If `surface` is not a surface.
 

@@ -55,7 +55,7 @@ def make_plan(
         ("min_strict", min_strict, np.inf),
         ("min_coverage", min_coverage, 1.0),
     ):
-        if not (isinstance(share, int | float) and 0.0 <= share <= most):
+        if not (isinstance(share, int | float | np.number) and 0.0 <= share <= most):
             raise OptionError(f"{option}={share!r}: give a share from 0 to 1")
     name = signal_name(log)
     signal = log[name] if axis is None else select_axes(log[name], axis)

@@ -69,7 +69,7 @@ def correlate(
         Longest time by which the gyro may follow the channel [s]; a tenth of the record by default,
         0 for none.
     level : float
-        Level of the intervals.
+        Confidence level of the intervals, from 0.5 to below 1.
 
     Returns
     -------
@@ -85,22 +85,34 @@ def correlate(
 
     Raises
     ------
-    OptionError, SchemaError, TimeError
-        If a name is unknown, the lag is invalid, or the channel does not overlap the record.
+    OptionError
+        If a channel or variable is unknown, or the lag or the level is invalid.
+    SchemaError
+        If `product` is not a product.
+    MissingUnitError
+        If a channel with a separate time coordinate has no units.
+    TimeError
+        If a channel does not overlap the record.
 
     Examples
     --------
-    >>> import gyrostab
-    >>> product = gyrostab.open_product("product.nc")                # doctest: +SKIP
-    >>> result = gyrostab.correlate(product, max_lag="2h")           # doctest: +SKIP
-    >>> result["window_mean_per_temperature"].sel(axis="x")          # doctest: +SKIP
+    >>> from gyrostab import davar, fit_noise, make_log
+    >>> temperature = 30.0 + 5.0 * np.sin(2.0 * np.pi * np.arange(36_000) / 9000.0)
+    >>> rate = 0.2 * temperature + np.random.default_rng(1).standard_normal(36_000)
+    >>> channels = {"temperature": (temperature, "degC")}
+    >>> log = make_log(rate, rate=10.0, unit="deg/h", channels=channels)
+    >>> product = fit_noise(davar(log, window="1min", step="30s"))
+    >>> result = correlate(product, variables="window_mean")
+    >>> slope = result["window_mean_per_temperature"].sel(axis="x")
+    >>> round(float(slope), 2), slope.unit_label
+    (0.2, 'deg/h/K')
     """
     from threadpoolctl import threadpool_limits
 
     product = with_axis(product)
     check_product(product)
     _check_windows(product)
-    if not (isinstance(level, int | float) and 0.5 <= level < 1.0):
+    if not (isinstance(level, int | float | np.number) and 0.5 <= level < 1.0):
         raise OptionError(
             f"level {level!r}: the level of an interval lies between 0.5 and 1, for instance 0.95"
         )

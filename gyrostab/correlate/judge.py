@@ -9,6 +9,7 @@ import xarray as xr
 
 from gyrostab.arrays import Floats, Ints
 from gyrostab.correlate.drivers import slope_units
+from gyrostab.errors import SchemaError
 
 #: Flag values of ``coupling_verdict``.
 VERDICTS = ("cannot_tell", "none_seen", "not_told_apart", "coupled")
@@ -184,7 +185,24 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
     -------
     list of dict
         Text by heading, the same headings in every row; ``-`` where the record gives no number.
+
+    Raises
+    ------
+    SchemaError
+        If `result` is not a result of `gyrostab.correlate`.
+
+    Examples
+    --------
+    >>> from gyrostab import correlate, davar, fit_noise, make_log
+    >>> rate, temperature = np.random.default_rng(1).standard_normal((2, 36_000))
+    >>> channels = {"temperature": (temperature, "degC")}
+    >>> log = make_log(rate, rate=10.0, unit="deg/h", channels=channels)
+    >>> product = fit_noise(davar(log, window="1min", step="30s"))
+    >>> row = correlation_rows(correlate(product, variables="window_mean"))[0]
+    >>> row["variable"], row["driver"], row["unit"], row["verdict"]
+    ('window_mean', 'temperature', 'deg/h/K', 'none seen')
     """
+    require_correlation(result)
     rows = []
     for a, axis in enumerate(result["axis"].values):
         for v, name in enumerate(result["variable"].values):
@@ -221,6 +239,14 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
                     }
                 )
     return rows
+
+
+def require_correlation(result: Any) -> None:
+    """Raise `SchemaError` unless this is a result of `gyrostab.correlate`."""
+    if not isinstance(result, xr.Dataset) or "coupling_verdict" not in result:
+        raise SchemaError(
+            "this holds no correlation; call gyrostab.correlate (or 'gyrostab correlate') first"
+        )
 
 
 def _format_partial(cell: xr.Dataset, name: str) -> str:

@@ -85,17 +85,19 @@ def diagnose(
         simulated log on the same time stamps, without what effects do to its mean rate. By default,
         the five noise terms calibrated on quiescent stretches of the recording.
     quiet : (start, end) or list of these, optional
-        Quiescent stretches, as seconds since the start or ISO times; detected automatically by
-        default. With a `simulation` they calibrate the level of its noise: one factor per axis.
+        Quiescent stretches, as durations after the start (``("0s", "30min")``; a number is in
+        seconds) or ISO times; detected automatically by default. With a `simulation` they calibrate
+        the level of its noise: one factor per axis.
     seed : int
         Seed of the null records.
     nulls : int
         Number of null records.
     false_alarm_level : float
         Probability that a recording without any missing physics gives a mismatch or an effect.
-    block : str or timedelta
+    block : str or timedelta, optional
+        Length of a block; by default 20 s, less in short records, more in records above 5.6 h.
     restart_gap : str or float
-        As in `gyrostab.diagnose.reduce.block_statistics.reduce_log`.
+        Shortest gap that counts as a power-off [s].
     progress : Stage
         Callback for progress.
     settings : Settings

@@ -39,11 +39,13 @@ from gyrostab.store.lazy import convert_values, hide_infinite
 from gyrostab.store.private import is_in_memory
 from gyrostab.store.read import MIN_LAZY_VALUES, make_variable_lazy
 from gyrostab.store.write import declare_counts
+from gyrostab.time.durations import duration_seconds
+from gyrostab.time.grid import check_rate
 from gyrostab.time.stamps import to_nanoseconds
 from gyrostab.units import HOUR, INNER, Unit, known_units, parse_unit
 
 
-def as_log(data: Any, *, converts_units: bool = True) -> xr.Dataset:
+def as_log(data: Any, *, converts_channels: bool = True) -> xr.Dataset:
     """Convert any supported object to a regular log; functions that take a log call this first.
 
     Parameters
@@ -52,8 +54,8 @@ def as_log(data: Any, *, converts_units: bool = True) -> xr.Dataset:
         A log, even after xarray operations (see `gyrostab.ingest.uniform.as_uniform`); a signal
         with units on ``time`` or ``(axis, time)``; a table with a DatetimeIndex and units in the
         names of its columns or in ``attrs["units"]``.
-    converts_units : bool
-        Convert the known units of channels of a Dataset to the inner ones.
+    converts_channels : bool
+        Convert the known units of channels of a Dataset to the inner ones, as those of the signal.
 
     Returns
     -------
@@ -76,7 +78,7 @@ def as_log(data: Any, *, converts_units: bool = True) -> xr.Dataset:
             return from_dataframe(data)
     if isinstance(data, xr.Dataset):
         data = _decode_packed(_reset_channels(_keep_on_disk(data)))
-        data = _convert_channels(data) if converts_units else data
+        data = _convert_units(data, channels=converts_channels)
     return as_uniform(data)
 
 
@@ -112,16 +114,19 @@ def _decode_variable(name: Any, variable: xr.Variable) -> xr.Variable:
     return xr.Variable(variable.dims, values, attrs)
 
 
-def _convert_channels(log: xr.Dataset) -> xr.Dataset:
-    """Convert the units of channels to the inner ones.
+def _convert_units(log: xr.Dataset, *, channels: bool = True) -> xr.Dataset:
+    """Convert the units of the gyro signal, and of channels, to the inner ones.
 
-    A unit that does not fit the name of its channel is kept, as is one that is not known.
+    A unit that does not fit the name of its variable is kept, as is one that is not known.
     """
     unusable, converted = find_unusable_channels(log), {}
-    for name in log_channels(log):
-        variable, quantity = log.variables[name], quantity_of(name)
+    signals = [name for name in SIGNAL_UNITS if name in log.data_vars]
+    for name in dict.fromkeys([*signals, *(log_channels(log) if channels else ())]):
+        variable = log.variables[name]
+        quantity = name if name in signals else quantity_of(name)
         text = str(variable.attrs.get("units", INNER["number"]))
-        if name in unusable or text in INNER.values():
+        is_number = name not in unusable and variable.dtype.kind in "biuf"
+        if not is_number or text in ([INNER[name]] if name in signals else INNER.values()):
             continue
         with suppress(UnitError):
             unit = parse_unit(text, quantity)
@@ -199,7 +204,7 @@ def from_dataarray(
     TimeError
         When ``time`` runs backwards, or has no sampling rate.
     OptionError
-        When the values are angles of unknown kind.
+        When the values are angles of unknown kind, or another option is invalid.
 
     Examples
     --------
@@ -209,6 +214,9 @@ def from_dataarray(
     >>> log.rate.values, log.attrs["sampling_rate_hz"]
     (array([[ 3600.,  7200., 14400.]]), 100.0)
     """
+    if rate is not None:
+        check_rate(rate, "rate")
+    longest_gap = duration_seconds(max_gap, "max_gap")
     log, increments = _dataset_of(da, units, kind)
     try:
         regular_log = as_uniform(log)
@@ -225,7 +233,7 @@ def from_dataarray(
         )
         with keyword_advice():
             regular_log = regularise(
-                raw.assign_attrs(source_files=["DataArray"]), rate=rate, max_gap=max_gap
+                raw.assign_attrs(source_files=["DataArray"]), rate=rate, max_gap=longest_gap
             )
     warn_notes(regular_log)
     if rate is not None and abs(rate / regular_log.attrs["sampling_rate_hz"] - 1) > 1e-6:
@@ -262,7 +270,7 @@ def _dataset_of(da: xr.DataArray, units: str | None, kind: str | None) -> tuple[
     if isinstance(values, np.ndarray) and (count := int(np.isinf(given).sum())):
         log_attrs["unreadable_cells"] = count
         log_attrs["notes"] = [f"DataArray: {count} gyro cells are infinite and become NaN"]
-    bare = _convert_channels(_decode_packed(_reset_channels(array.coords.to_dataset())))
+    bare = _convert_units(_decode_packed(_reset_channels(array.coords.to_dataset())))
     if unusable := find_unusable_channels(bare.reset_coords()):
         log_attrs["notes"] = [
             *log_attrs.get("notes", ()),

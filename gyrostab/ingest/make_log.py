@@ -24,7 +24,7 @@ def make_log(
     *,
     rate: float,
     unit: str,
-    start: str = "1970-01-01T00:00:00",
+    start: Any = "1970-01-01T00:00:00",
     axis: Sequence[str] | None = None,
     kind: str = "rate",
     channels: Mapping[str, tuple[Any, str]] | None = None,
@@ -40,14 +40,16 @@ def make_log(
         Sampling rate [Hz].
     unit : str
         Unit of the values, for instance ``"deg/s"`` or ``"0.1 arcsec/s"``.
-    start : str
-        Time of the first sample, ISO 8601, UTC.
+    start : str or datetime
+        Time of the first sample; text is ISO 8601, UTC unless it has an offset. A bare number is
+        refused.
     axis : sequence of str, optional
         Names of the axes; x, y, z by default.
     kind : {"rate", "angle"}
         Kind of the values: rates or cumulative angles.
     channels : mapping, optional
-        Name -> (values on the same time, unit), for instance ``{"temperature": (t, "degC")}``.
+        Name -> (values on the same time, unit), for instance ``{"temperature": (t, "degC")}``;
+        numpy or dask.
 
     Returns
     -------
@@ -144,5 +146,5 @@ def _channel_variable(name: str, channel: Any, size: int) -> xr.Variable:
             f"channel {name!r}: {text!r} is a unit of {unit.quantity}, not of {quantity}; known "
             f"are {known_units(quantity)}"
         )
-    converted = np.asarray(values) * unit.factor + unit.offset
+    converted = values * unit.factor + unit.offset
     return xr.Variable("time", converted, {"units": INNER[unit.quantity]})

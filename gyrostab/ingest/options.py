@@ -58,7 +58,11 @@ class ReadOptions:
             if value is not None:
                 stamp_ns(value, f"--{name}")
         for name in ("map", "unit"):
-            given = {str(key): value for key, value in (getattr(self, name) or {}).items()}
+            given = getattr(self, name) or {}
+            if not isinstance(given, Mapping):
+                example = {"wx": "gyro_x"} if name == "map" else {"gyro": "deg/s"}
+                raise OptionError(f"{name}={given!r}: give a mapping, for instance {example}")
+            given = {str(key): value for key, value in given.items()}
             for key, value in given.items():
                 if not isinstance(value, str):
                     raise OptionError(f"--{name} {key}: {value!r} is not a text; give one")

@@ -27,6 +27,7 @@ from gyrostab.ingest.options import ReadOptions
 from gyrostab.ingest.raw_rows import stamp_span
 from gyrostab.ingest.uniform import check_same_rate
 from gyrostab.schema import texts
+from gyrostab.time.durations import duration_seconds
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
 #: Largest share of unreadable files; more suggest a wrong option instead of damage.
@@ -125,6 +126,7 @@ def read_log(
     >>> print(raw.attrs["notes"][-1])
     log.csv: 1 of 3 rows are unreadable: line 3 ('****')
     """
+    longest_gap = duration_seconds(max_gap, "max_gap")
     options = ReadOptions(
         rate=rate,
         start=start,
@@ -155,7 +157,7 @@ def read_log(
         log = concatenate_logs(
             [_check_regular(part, path.name, options) for path, part in parts.items()],
             regular,
-            max_gap=max_gap,
+            max_gap=longest_gap,
             lost=list(spans.values()),
             limits=options.limits,
         )

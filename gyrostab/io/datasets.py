@@ -24,7 +24,7 @@ import xarray as xr
 from gyrostab.errors import OptionError
 from gyrostab.ingest.convert import as_log
 from gyrostab.noise import LAWS
-from gyrostab.schema import SIGNAL_UNITS, check_product
+from gyrostab.schema import SIGNAL_UNITS, check_product, with_axis
 from gyrostab.store.cf import to_disk
 from gyrostab.store.output import find_foreign_item, find_sources, new_output
 from gyrostab.store.private import library_lock
@@ -65,7 +65,8 @@ def to_netcdf(
     ----------
     dataset : xarray.Dataset
         In memory ``(axis, time, tau)``, units as in `gyrostab.units.INNER`. A log is written with
-        the sampling rate of its ``time``, and with NaN where samples have been dropped.
+        the sampling rate of its ``time``, with NaN where samples have been dropped, and with its
+        signal in degree hour-1 or degree; other coordinates and channels are kept as they are.
     path : path-like
         The file to write. It takes this name only once it is complete.
     overwrite : bool
@@ -90,6 +91,8 @@ def to_netcdf(
         When the compression is unknown, or when the dataset reads from the file.
     OutputError
         When the file exists, or cannot be written; nothing half-written is left behind.
+    SchemaError
+        When the signal of a log has no units, or no known ones.
     TimeError
         When the time of a log is not in order, or not uniform.
 
@@ -118,15 +121,10 @@ def _compute_time_axes(dataset: Any) -> xr.Dataset:
     """Compute the time axis, sampling rate and table of gaps of a log; return others unchanged."""
     if not isinstance(dataset, xr.Dataset):
         return as_log(dataset)
-    for name, units in SIGNAL_UNITS.items():
-        signal = dataset.variables.get(name)
-        if (
-            signal is not None
-            and "time" in signal.dims
-            and set(signal.dims) <= {"axis", "time"}
-            and signal.attrs.get("units") == units
-        ):
-            return as_log(dataset, converts_units=False)
+    for name in SIGNAL_UNITS:
+        signal = dataset.data_vars.get(name)
+        if signal is not None and "time" in signal.dims and set(signal.dims) <= {"axis", "time"}:
+            return as_log(dataset, converts_channels=False)
     return dataset
 
 
@@ -385,7 +383,19 @@ def to_csv(product: xr.Dataset, path: str | os.PathLike[str], *, overwrite: bool
     ------
     OutputError, SchemaError
         When the file exists or cannot be written, or `product` is not a product.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from gyrostab import davar, fit_noise, make_log
+    >>> log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = to_csv(fit_noise(davar(log, window="20s")), folder + "/product.csv")
+    ...     table = pd.read_csv(path)
+    >>> list(table.columns[:3]), len(table)
+    (['time', 'axis', 'window_mean [degree hour-1]'], 21)
     """
+    product = with_axis(product)
     check_product(product)
     units = {name: law.label for name, law in LAWS.items()}
     units |= {f"{name}_{end}": units[name] for name in LAWS for end in ("stderr", "upper")}

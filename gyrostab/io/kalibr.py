@@ -50,7 +50,7 @@ from gyrostab.ingest.convert import as_log
 from gyrostab.ingest.make_log import make_log
 from gyrostab.ingest.uniform import cut_log
 from gyrostab.noise import LAWS
-from gyrostab.schema import check_product, texts
+from gyrostab.schema import check_product, texts, with_axis
 from gyrostab.store.output import new_output
 from gyrostab.units import HOUR
 
@@ -162,7 +162,18 @@ def to_kalibr(
         does not cover the product, or `product` has no attribute ``window_s`` or ``step_s`` for it.
     OutputError
         When the file exists, or cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from gyrostab import davar, fit_noise, make_log
+    >>> log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = to_kalibr(fit_noise(davar(log, window="20s")), folder + "/imu.yaml")
+    ...     print(path.read_text().splitlines()[5])
+    update_rate: 100.0  # Hz
     """
+    product = with_axis(product)
     check_product(product)
     rate = product.attrs.get("sampling_rate_hz")
     if rate is None:

@@ -104,6 +104,18 @@ def open_surface(path: str | os.PathLike[str]) -> xr.Dataset:
     ------
     FormatError
         When the file does not exist, when it is damaged, or when it holds something else.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from gyrostab import davar, make_log, to_netcdf
+    >>> log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = to_netcdf(davar(log, window="20s"), folder + "/davar.nc")
+    ...     with open_surface(folder + "/davar.nc") as surface:
+    ...         print(surface.avar.dims)
+    ('axis', 'time', 'tau')
     """
     return _open_path(path, "a DAVAR surface", check_surface, "make one with 'gyrostab davar'")
 
@@ -180,7 +192,7 @@ def open_content(path: str | os.PathLike[str], *, strict: bool = False) -> xr.Da
 
 def _restore_log(log: xr.Dataset, path: str | os.PathLike[str]) -> xr.Dataset:
     try:
-        return as_log(log, converts_units=False)
+        return as_log(log, converts_channels=False)
     except (SchemaError, TimeError) as error:
         log.close()
         raise type(error)(f"{path}: {error}") from error

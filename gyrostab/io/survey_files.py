@@ -96,6 +96,17 @@ def to_iscwsa(
         When an option makes no sense, or the suffix of the file is not one of the three.
     OutputError
         When the file exists, or cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from gyrostab import davar, fit_noise, make_log
+    >>> log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     model = to_iscwsa(fit_noise(davar(log, window="20s")), folder + "/tool.csv")
+    >>> model.terms[0].code, model.terms[0].unit
+    ('GXY-RN', 'deg/h')
     """
     _check_course(running_speed, continuous_from)
     path = check_output(path, suffixes=list(SUFFIXES), overwrite=overwrite)

@@ -38,7 +38,7 @@ from gyrostab.allan.summary import TermSummary, find_constant_axes, summarise_fi
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.io.survey_model import KINDS, TABLES, Groups, Status, SurveyModel, SurveyTerm, Tool
 from gyrostab.noise import LAWS
-from gyrostab.schema import texts
+from gyrostab.schema import texts, with_axis
 from gyrostab.time.durations import duration_seconds
 
 if TYPE_CHECKING:
@@ -154,6 +154,7 @@ def survey_terms(
         raise OptionError(
             f"diagnosis is a {type(diagnosis).__name__}: give gyrostab.open_diagnosis(folder)"
         )
+    product = with_axis(product)
     summaries = summarise_terms(product)
     tool = _find_tool([summary.axis for summary in summaries])
     magnitudes = _compute_magnitudes(summaries, statistic, times)

@@ -66,6 +66,13 @@ def plot_adev(
     ------
     SchemaError, OptionError
         If `product` is not a surface or has no such axis, or `when` is outside the record.
+
+    Examples
+    --------
+    >>> from gyrostab import davar, make_log
+    >>> log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
+    >>> plot_adev(davar(log, window="20s"), "x").axes[0].get_xscale()
+    'log'
     """
     product = with_axis(product)
     check_surface(product)

@@ -63,6 +63,13 @@ def plot_coefficients(
     ------
     SchemaError, OptionError
         If `product` has no coefficients or no such axis.
+
+    Examples
+    --------
+    >>> from gyrostab import davar, fit_noise, make_log
+    >>> log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
+    >>> len(plot_coefficients(fit_noise(davar(log, window="20s"))).axes)  # Q, N, B, K and R
+    5
     """
     product = with_axis(product)
     require_coefficients(product)

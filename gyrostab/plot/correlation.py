@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.correlate.drivers import MAX_GAP_SPACINGS, interpolate_values
-from gyrostab.correlate.judge import VERDICTS, format_p_value
+from gyrostab.correlate.judge import VERDICTS, format_p_value, require_correlation
 from gyrostab.errors import SchemaError
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import (
@@ -72,13 +72,19 @@ def plot_correlation(
     Raises
     ------
     SchemaError, OptionError
-        If `result` is not a correlation or has no such axis.
+        If `result` is not a correlation or has no such axis or driver.
+
+    Examples
+    --------
+    >>> from gyrostab import correlate, davar, fit_noise, make_log
+    >>> rate, temperature = np.random.default_rng(1).standard_normal((2, 36_000))
+    >>> channels = {"temperature": (temperature, "degC")}
+    >>> log = make_log(rate, rate=10.0, unit="deg/h", channels=channels)
+    >>> product = fit_noise(davar(log, window="1min", step="30s"))
+    >>> plot_correlation(correlate(product, variables="window_mean")).axes[0].get_ylabel()
+    'window mean [deg/h]'
     """
-    if "coupling_verdict" not in result:
-        raise SchemaError(
-            "this dataset holds no correlation; call gyrostab.correlate (or 'gyrostab correlate') "
-            "first"
-        )
+    require_correlation(result)
     names = axis_names(result, axis)
     driver = str(result["driver"].values[0]) if driver is None else driver
     if driver not in result["driver"].values:

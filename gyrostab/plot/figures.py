@@ -17,7 +17,7 @@ from gyrostab.plot.coefficients import plot_coefficients
 from gyrostab.plot.correlation import plot_correlation
 from gyrostab.plot.style import PAGE_MM, axis_names, save_png
 from gyrostab.plot.surface import plot_davar, plot_davar_3d
-from gyrostab.schema import check_product
+from gyrostab.schema import check_product, with_axis
 from gyrostab.store.output import check_folder, new_folder
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ def product_figures(
     one, and for each axis ``adev_<axis>`` and ``davar_3d_<axis>`` (the latter only with at least
     two windows and two averaging times).
     """
+    product = with_axis(product)
     check_product(product)
     figures: dict[str, Callable[..., Figure]] = {
         "coefficients": partial(plot_coefficients, product),
@@ -91,6 +92,17 @@ def save_figures(
     OutputError
         If a figure exists and `overwrite` is False, or the folder cannot be written to; then no
         figure is written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> from gyrostab import davar, fit_noise, make_log
+    >>> log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
+    >>> product = fit_noise(davar(log, window="20s"))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [path.name for path in save_figures(product, folder, dpi=30)]
+    ['coefficients.png', 'davar.png', 'davar_change.png', 'adev_x.png', 'davar_3d_x.png']
     """
     folder = Path(folder)
     figures: dict[str, Callable[[], Figure]] = {}

@@ -76,7 +76,14 @@ def plot_davar(
     Raises
     ------
     SchemaError, OptionError
-        If `product` is not a surface or has no such axis.
+        If `product` is not a surface or has no such axis, or `columns` is less than 1.
+
+    Examples
+    --------
+    >>> from gyrostab import davar, make_log
+    >>> log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
+    >>> len(plot_davar(davar(log, window="20s")).axes)  # one axis and the colour bar
+    2
     """
     product = with_axis(product)
     check_surface(product)
@@ -146,7 +153,14 @@ def plot_davar_3d(
     Raises
     ------
     SchemaError, OptionError
-        If `product` is not a surface or has no such axis.
+        If `product` is not a surface or has no such axis, or `columns` is less than 1.
+
+    Examples
+    --------
+    >>> from gyrostab import davar, make_log
+    >>> log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
+    >>> len(plot_davar_3d(davar(log, window="20s")).axes)
+    1
     """
     product = with_axis(product)
     check_surface(product)
@@ -204,6 +218,8 @@ def _merge_windows(
 
     The cells of an axis are the Allan deviation and the mask of weighted cells, shape (time, tau).
     """
+    if columns < 1:
+        raise OptionError(f"columns={columns!r}: give a number above 0, for instance 1500")
     merged = max(1, -(-product.sizes["time"] // columns))
     part = product[["avar", "estimator"]].sel(axis=names).drop_vars("time").compute()
     is_weighted = (part["estimator"] == _WEIGHTED).astype(np.float64)

@@ -166,6 +166,11 @@ def write_diagnosis(
         When the content is not that of a diagnosis.
     OutputError
         When the folder exists, holds something else, or cannot be written.
+
+    Examples
+    --------
+    >>> found = gyrostab.diagnose(gyrostab.open_log("run7.nc"))  # doctest: +SKIP
+    >>> gyrostab.write_diagnosis(found, "run7-diagnosis")  # doctest: +SKIP
     """
     check_diagnosis(diagnosis.content)
     directory = Path(directory)

@@ -15,7 +15,7 @@ from gyrostab.noise import LAWS
 from gyrostab.plot.style import axis_names, encode_png, unit_symbol
 from gyrostab.report.charts import page_text
 from gyrostab.report.product_charts import product_charts, window_data
-from gyrostab.schema import GAP_CAUSES, check_product, texts
+from gyrostab.schema import GAP_CAUSES, check_product, texts, with_axis
 from gyrostab.store.output import new_output
 from gyrostab.time.durations import format_duration
 from gyrostab.wording import format_share
@@ -61,7 +61,18 @@ def write_report(
         If `product` is not a product or `log` is not a log.
     OutputError
         If the file exists or cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from gyrostab import davar, fit_noise, make_log
+    >>> log = make_log(np.random.default_rng(1).standard_normal(6000), rate=100.0, unit="deg/h")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = write_report(fit_noise(davar(log, window="20s")), folder + "/report.html")
+    ...     path.name, "plotly" in path.read_text(encoding="utf-8")
+    ('report.html', True)
     """
+    product = with_axis(product)
     check_product(product)
     if log is not None:
         log = as_log(log)

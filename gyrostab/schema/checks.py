@@ -19,6 +19,7 @@ from gyrostab.schema.variables import (
     UPPER_LIMIT_ONLY,
     VARIABLES,
 )
+from gyrostab.units import known_units
 
 #: What tau may differ from a whole number of samples, as a share: the rounding of stored numbers,
 #: far below a sample in any window.
@@ -300,7 +301,8 @@ def _check_units(dataset: xr.Dataset, name: str) -> None:
     if units != SIGNAL_UNITS[name]:
         raise SchemaError(
             f"variable {name!r} has units {units!r}, expected {SIGNAL_UNITS[name]!r}; "
-            f"gyrostab.from_dataarray(dataset[{name!r}]) converts it"
+            f"known units of a Dataset are converted ({known_units(name)}), also by "
+            "gyrostab.to_netcdf"
         )
 
 

@@ -79,12 +79,13 @@ def simulate(
         Length of the log ("200h"); a number is in seconds. Without it that of the model, or of
         `like`.
     rate : float, optional
-        Sampling rate [Hz].
-    start : str, optional
-        Time of the first sample, ISO 8601, UTC.
+        Sampling rate [Hz]; that of the model by default.
+    start : str or datetime, optional
+        Time of the first sample; text is ISO 8601, UTC unless it has an offset. That of the model
+        by default, or 1970-01-01.
     seed : int, optional
         The same seed gives the same bits, whatever the chunks; with and without effects it gives
-        the same noise. 0 by default.
+        the same noise. That of the model by default, or 0.
     like : xarray.Dataset, optional
         Regular log whose stamps, gaps and channels are taken; rate and start are then its own, and
         its axes those that the model names, or all.

@@ -136,10 +136,11 @@ def add_environment(
     """Channels and gaps of the model and of `environment`, without those of a recording."""
     parts = []
     counts: dict[str, int] = {}
+    common = {"duration": frame.size / frame.rate, "start": np.datetime64(frame.start, "ns")}
     for name, values in model.environment:
         function = PROFILES[name][0]
         counts[name] = counts.get(name, 0) + 1
-        arguments = {"duration": frame.size / frame.rate, "start": frame.start, **values}
+        arguments = {**common, **values}
         if "seed" in inspect.signature(function).parameters:
             arguments.setdefault("seed", _number_seed(frame.seed, name, counts[name]))
         parts.append(function(**arguments))

@@ -264,11 +264,18 @@ def make_noise(
         if not isinstance(value, int | np.integer):
             raise OptionError(f"{name}={value!r}: give a whole number of samples")
     if gauss_markov and not (
-        all(math.isfinite(value) for value in gauss_markov) and gauss_markov[1] > 0.0
+        len(gauss_markov) == 2
+        and all(math.isfinite(value) for value in gauss_markov)
+        and gauss_markov[1] > 0.0
     ):
         raise OptionError(
             f"gauss_markov={gauss_markov!r}: give the standard deviation in deg/h and the "
             "correlation time in s, above 0"
+        )
+    if sinusoid and not (len(sinusoid) == 3 and all(math.isfinite(value) for value in sinusoid)):
+        raise OptionError(
+            f"sinusoid={sinusoid!r}: give the amplitude in deg/h, the frequency in Hz and the "
+            "phase in rad"
         )
     terms = "".join(term for term in "QNBK" if coefficients[term] > 0.0)
     noise = begin_noise(seed, axis, rate=rate, terms=terms, flicker_band=flicker_band)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 
 from gyrostab.arrays import Ints
 from gyrostab.errors import OptionError
@@ -47,6 +48,7 @@ def duration_seconds(
     >>> duration_seconds("10min", "window")
     600.0
     """
+    value = _take_number(value)
     try:
         if isinstance(value, str):
             if _is_bare_number(value) and not (zero and float(value) == 0.0):
@@ -67,8 +69,15 @@ def duration_seconds(
             f"{option} {value!r} is not a duration; write for instance {example}"
         ) from error
     if not (np.isfinite(seconds) and (seconds > 0 or (zero and seconds == 0))):
-        raise OptionError(f"{option} {value!r} must be longer than zero")
+        least = "zero or longer" if zero else "longer than zero"
+        raise OptionError(f"{option} {value!r} must be {least}")
     return float(seconds)
+
+
+def _take_number(value: Any) -> Any:
+    """Return the number of an array without dimensions, such as ``surface.tau[3]``."""
+    is_array = isinstance(value, xr.DataArray | np.ndarray) and value.ndim == 0
+    return np.asarray(value)[()] if is_array else value
 
 
 def _timedelta_seconds(value: Any) -> float:
@@ -140,6 +149,7 @@ def samples(value: Any, rate: float, option: str) -> int:
     >>> samples("10s", 400.0, "window"), samples("2000samples", 400.0, "window")
     (4000, 2000)
     """
+    value = _take_number(value)
     if _is_bare_number(value):
         text = str(value).strip()
         raise OptionError(
@@ -255,7 +265,7 @@ def averaging_factors(
 def _listed_factors(taus: Any, rate: float, longest: int, order: int) -> Ints:
     """Return the averaging factors of a list of durations, of which `longest` is the largest."""
     ks, moved = [], []
-    for tau in taus:
+    for tau in map(_take_number, taus):
         samples = duration_seconds(tau, "tau", example=TAUS) * rate
         k = round(samples)
         if k < 1:

@@ -127,12 +127,13 @@ def split_instant(text: str) -> tuple[int, int, int, int] | None:
 
 
 def stamp_ns(start: Any, name: str = "start") -> int:
-    """Convert an instant, as text or as nanoseconds since 1970, to nanoseconds since 1970.
+    """Convert an instant to nanoseconds since 1970.
 
     Parameters
     ----------
-    start : str, int or datetime
-        The instant; text is ISO 8601, UTC unless it says otherwise.
+    start : str or datetime
+        The instant; text is ISO 8601, UTC unless it says otherwise. A bare number is refused: it
+        could be seconds or nanoseconds.
 
     Raises
     ------
@@ -144,8 +145,6 @@ def stamp_ns(start: Any, name: str = "start") -> int:
     >>> stamp_ns("1970-01-01T02:00:01+02:00")
     1000000000
     """
-    if isinstance(start, int | np.integer):
-        return int(start)
     try:
         if isinstance(start, str):
             fields = split_instant(start)
@@ -155,7 +154,7 @@ def stamp_ns(start: Any, name: str = "start") -> int:
             stamp = days * 86400 * NANOSECONDS + fields[3]
         else:
             time = pd.Timestamp(start)
-            if pd.isna(time) or isinstance(start, float | np.floating):
+            if pd.isna(time) or isinstance(start, int | float | np.number):
                 raise ValueError("no time")
             stamp = int((time.tz_convert(None) if time.tzinfo else time).as_unit("ns").value)
     except pd.errors.OutOfBoundsDatetime:

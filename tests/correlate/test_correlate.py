@@ -19,7 +19,7 @@ from gyrostab.correlate.dataset import join
 from gyrostab.correlate.drivers import Driver
 from gyrostab.correlate.fit import fit_driver, make_blocks
 from gyrostab.correlate.judge import VERDICTS, format_correlation
-from gyrostab.errors import MissingUnitError, OptionError, TimeError, UnitError
+from gyrostab.errors import MissingUnitError, OptionError, SchemaError, TimeError, UnitError
 from gyrostab.kernels.regression.coupling import (
     calibrated,
     decompose,
@@ -845,3 +845,9 @@ def test_only_the_rate_of_change_of_a_channel_needs_no_plateau(name):
 @pytest.mark.parametrize("none", [0, "0", "0min", np.timedelta64(0, "s")])
 def test_no_lag_can_be_written_in_any_way(none):
     assert float(gyrostab.correlate(coupled.product(), max_lag=none).attrs["longest_lag_s"]) == 0.0
+
+
+@pytest.mark.parametrize("use", [gyrostab.correlation_rows, gyrostab.plot_correlation])
+def test_a_product_without_a_correlation_is_refused(use):
+    with pytest.raises(SchemaError, match=r"call gyrostab\.correlate"):
+        use(coupled.product())

@@ -234,3 +234,10 @@ def test_a_channel_is_not_called_like_a_dimension_of_texts_in_a_file(tmp_path):
     product = gyrostab.fit_noise(gyrostab.davar(log, window="10s"))
     stored = gyrostab.to_netcdf(product, tmp_path / "product.nc")
     assert "string1_channel" in gyrostab.open_product(stored)
+
+
+def test_lazy_channels_stay_lazy():
+    kelvin = da.from_array(VALUES, chunks=20)
+    log = make_log(VALUES, rate=10.0, unit="deg/h", channels={"temperature": (kelvin, "K")})
+    assert log.temperature.chunks == ((20, 20, 10),)
+    np.testing.assert_allclose(log.temperature, VALUES - 273.15)

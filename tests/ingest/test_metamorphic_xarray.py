@@ -348,6 +348,33 @@ def test_units_of_channels_are_converted(name, units, value, inner, expected, ch
     assert (log[name].chunks is not None) == chunked
 
 
+@pytest.mark.parametrize(
+    ("units", "size"), [("deg/s", 3600.0), ("degree s-1", 3600.0), ("°/h", 1.0)]
+)
+@pytest.mark.parametrize("chunked", [False, True])
+def test_units_of_the_signal_are_converted(units, size, chunked, tmp_path):
+    x = record()
+    log = make(x)
+    log["rate"] = (log.rate / size).assign_attrs(units=units)
+    log = log.chunk(time=999) if chunked else log
+    check_against(log, x, rate=RATE)
+    check_against(log.isel(axis=1), x[1], rate=RATE)
+    check_against(gyrostab.open_log(gyrostab.to_netcdf(log, tmp_path / "log.nc")), x, rate=RATE)
+    assert (as_log(log).rate.chunks is not None) == chunked
+
+
+@pytest.mark.parametrize("units", ["furlong", "degC", "deg", "1", None])
+@pytest.mark.parametrize("axis", [slice(None), 1])
+def test_a_signal_without_a_known_unit_is_neither_used_nor_written(units, axis, tmp_path):
+    log = make()
+    log["rate"].attrs = {} if units is None else {"units": units}
+    with pytest.raises(SchemaError, match=r"has no units|has units .* deg/s"):
+        gyrostab.davar(log.isel(axis=axis), window="8s")
+    with pytest.raises(SchemaError, match=r"has no units|has units .* deg/s"):
+        gyrostab.to_netcdf(log.isel(axis=axis), tmp_path / "log.nc")
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_file_keeps_the_units_of_channels(tmp_path):
     log = make().assign(temperature_case=("time", np.full(SIZE, 293.15), {"units": "K"}))
     stored = gyrostab.open_log(gyrostab.to_netcdf(log, tmp_path / "log.nc"))
@@ -559,6 +586,11 @@ class TestDataArray:
         with pytest.raises(UnitError, match="not known"):
             gyrostab.from_dataarray(make(x).rate, units="furlong")
 
+    @pytest.mark.parametrize("option", [{"rate": "100"}, {"rate": -1.0}, {"max_gap": "soon"}])
+    def test_options_are_checked_though_the_time_is_uniform(self, option):
+        with pytest.raises(OptionError, match=next(iter(option))):
+            gyrostab.from_dataarray(make().rate, **option)
+
     def test_angles(self):
         theta = np.cumsum(record()[0]) / 3600 / RATE
         log = make_log(theta, rate=RATE, unit="deg", kind="angle", start=START)
@@ -665,9 +697,6 @@ class TestDataFrame:
         ):  # fmt: skip
             with pytest.raises(SchemaError, match=r"this is a DataFrame.*gyrostab\.from_dataframe"):
                 function(self.frame(x))
-        foreign = make(x).assign(rate=make(x).rate.assign_attrs(units="deg/s"))
-        with pytest.raises(SchemaError, match=r"gyrostab\.from_dataarray\(dataset\['rate'\]\)"):
-            gyrostab.davar(foreign, window="8s")
         with pytest.raises(SchemaError, match=r"transpose it: df\.T"):
             gyrostab.davar(self.frame(x).T, window="8s")
         with pytest.raises(SchemaError, match="not times"):

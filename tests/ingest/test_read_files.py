@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -518,6 +519,20 @@ def test_channels_can_be_added_to_and_read_from_a_regular_log(tmp_path: Path) ->
     )
     assert raw.vibration.sizes["time_vibration"] == 5000
     assert raw.temperature.sizes["time_temperature"] == 4
+
+
+@pytest.mark.parametrize(
+    ("option", "advice"),
+    [
+        ({"unit": "deg/s"}, "unit='deg/s': give a mapping, for instance {'gyro': 'deg/s'}"),
+        ({"map": "wx=gyro_x"}, "map='wx=gyro_x': give a mapping, for instance {'wx': 'gyro_x'}"),
+        ({"max_gap": "soon"}, "max_gap 'soon' is not a duration"),
+    ],
+)
+def test_invalid_options_are_refused(tmp_path: Path, option: dict[str, str], advice: str) -> None:
+    path = write(tmp_path / "a.csv", "time [s],gyro_x [deg/h]\n0,1\n1,2\n")
+    with pytest.raises(OptionError, match=re.escape(advice)):
+        read_log(path, **option)
 
 
 def test_a_log_in_wrong_units_is_refused(tmp_path: Path) -> None:

@@ -64,6 +64,9 @@ def test_signal_of_chosen_axis_and_channels():
         plot_signal(synthetic.log(), channels="mud")
     with pytest.raises(OptionError, match="columns=0: give a number above 0"):
         plot_signal(synthetic.log(), columns=0)
+    for draw in (plot_davar, plot_davar_3d):
+        with pytest.raises(OptionError, match="columns=0: give a number above 0"):
+            draw(synthetic.product(), columns=0)
     with pytest.raises(OptionError, match="axis 'q' is not in the data; it has x, y, z"):
         plot_signal(synthetic.log(), axis="q")
 

@@ -210,6 +210,8 @@ def test_level_may_change_from_sample_to_sample():
         ({"size": 1000.0}, "size=1000.0: give a whole number of samples"),
         ({"gauss_markov": (1.0, 0.0)}, "gauss_markov=.*correlation time in s, above 0"),
         ({"gauss_markov": (1.0, -5.0)}, "gauss_markov=.*correlation time in s, above 0"),
+        ({"gauss_markov": (1.0,)}, "gauss_markov=.*correlation time in s, above 0"),
+        ({"sinusoid": (1.0, 2.0)}, "sinusoid=.*phase in rad"),
         ({"B": 1.0, "flicker_band": (1e-60, 1.0)}, "1e-60 to 1 Hz begins below 1e-30 Hz; give the"),
         ({"B": 1.0, "flicker_band": (2.0, 1.0)}, "band of flicker noise 2 to 1 Hz is empty"),
     ],

@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -119,3 +120,12 @@ def test_durations_of_several_units_are_read(text, seconds):
 @pytest.mark.parametrize("seconds", [1e-5, 0.25, 59.9996, 90.0, 7200.0, 14288.4 * 86400, 1e9])
 def test_a_formatted_duration_is_one_that_options_take(seconds):
     assert duration_seconds(format_duration(seconds), "window") == pytest.approx(seconds, rel=5e-4)
+
+
+def test_an_averaging_time_of_a_surface_is_a_duration():
+    tau = xr.DataArray([0.1, 1.0], dims="tau", attrs={"units": "s"})
+    np.testing.assert_array_equal(averaging_factors(tau, rate=10.0, window=100), [1, 10])
+    assert averaging_factors("all", rate=10.0, window=100, tau_max=tau[1])[-1] == 10
+    assert duration_seconds(xr.DataArray(np.timedelta64(90, "s")), "window") == 90.0
+    with pytest.raises(OptionError, match=r"window 1\.0 has no unit"):
+        samples(tau[1], 10.0, "window")

@@ -52,3 +52,9 @@ def test_a_log_of_far_dates_is_refused(rate):
     signal = xr.DataArray(np.zeros(100), {"time": times}, "time", attrs={"units": "deg/h"})
     with pytest.raises(TimeError, match="outside the years 1678 to 2262"):
         from_dataarray(signal, rate=rate)
+
+
+@pytest.mark.parametrize("number", [0, 1_767_225_600, np.int64(5), 5.0, True])
+def test_a_bare_number_is_no_instant(number):
+    with pytest.raises(OptionError, match="is not a date and time"):
+        stamp_ns(number)

@@ -14,7 +14,12 @@ from gyrostab.errors import OptionError
 
 @app.command(sort_key=6, help_epilogue="")
 def report(
-    product: Product, /, *, output: Output, log: Path | None = None, common: Common = Common()
+    product: Product,
+    /,
+    *,
+    output: Output,
+    log: Annotated[Path | None, Parameter(metavar="LOG.nc")] = None,
+    common: Common = Common(),
 ) -> None:
     """Write a self-contained HTML report of a product or a diagnosis, with figures.
 
@@ -27,7 +32,7 @@ def report(
     output
         HTML file to write.
     log
-        Log from which the product was computed; adds a figure of the signal.
+        Log of the product, written by gyrostab ingest; adds a figure of the signal.
     """
     from gyrostab.io.opening import open_log, open_product
     from gyrostab.report import write_diagnosis_report, write_report

@@ -14,6 +14,7 @@ from gyrostab.diagnose.predict.windows import fill_linearly
 from gyrostab.diagnose.reduce.schema import format_time, weighted_mean
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import OptionError
+from gyrostab.ingest.uniform import parse_instant
 from gyrostab.time.stamps import stamp_ns
 
 #: Blocks over which the noise level is averaged. Design choice.
@@ -236,11 +237,10 @@ def _is_usable(blocks: xr.Dataset, chosen: Bools, better_count: int) -> bool:
 
 def _seconds_since_start(blocks: xr.Dataset, edge: Any) -> float:
     """Return a time in seconds since the start of the record."""
-    if isinstance(edge, int | float | np.integer | np.floating):
-        return float(edge)
-    start = np.datetime64(str(blocks.attrs["start"]).removesuffix("Z"), "ns")
-    instant = np.datetime64(stamp_ns(str(edge), "quiet:"), "ns")
-    return float((instant - start) / np.timedelta64(1, "ns")) / 1e9
+    instant = parse_instant(edge, "quiet:")
+    if isinstance(instant, float):
+        return instant
+    return (instant - stamp_ns(str(blocks.attrs["start"]))) / 1e9
 
 
 def find_quiescent_spans(blocks: xr.Dataset, quiescent: Bools) -> list[list[str]]:

@@ -248,6 +248,7 @@ def regularise(
     """
     if rate is not None:
         check_rate(rate, "rate")
+    longest_gap, limits = duration_seconds(max_gap, "max_gap"), check_limits(limits)
     is_log = isinstance(raw, xr.Dataset) and "row" not in raw.dims
     if is_log and "sampling_rate_hz" in raw.attrs:
         log = as_uniform(raw)
@@ -256,7 +257,7 @@ def regularise(
         return log
     check_raw(raw)
     if "axis_rows" in raw.attrs:
-        options: dict[str, Any] = {"max_gap": max_gap, "limits": limits}
+        options: dict[str, Any] = {"max_gap": longest_gap, "limits": limits}
         parts = [part.assign_attrs(notes=[]) for part in _drop_empty_channels(split_axes(raw))]
         logs = [regularise(part, rate=rate, **options) for part in parts]
         labels, note = _describe_axes(raw.attrs["axis_rows"], parts, logs)
@@ -264,7 +265,7 @@ def regularise(
         return log.assign_attrs(notes=[*texts(raw, "notes"), *texts(log, "notes"), note])
     given = rate if rate is not None else raw.attrs.get("declared_rate_hz")
     declared = None if given is None else float(given)
-    return _place_log(raw, declared, duration_seconds(max_gap, "max_gap"), check_limits(limits))
+    return _place_log(raw, declared, longest_gap, limits)
 
 
 def _place_log(

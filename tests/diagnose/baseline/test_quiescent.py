@@ -10,6 +10,7 @@ import gyrostab
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise, calibrate_on_training_blocks
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
+from gyrostab.diagnose.baseline.quiescent import given_quiescent_blocks
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.errors import OptionError
 from tests.diagnose.baseline.test_calibrate import NOISE, SHAKEN, log
@@ -21,6 +22,24 @@ def value_of(baseline, term, axis="x"):
     return tuple(
         float(baseline[name].sel(axis=axis, term=term)) for name in ("coefficient", "stderr")
     )
+
+
+@pytest.mark.parametrize(
+    "span",
+    [
+        ("2min", "4min"),
+        (np.timedelta64(2, "m"), np.timedelta64(4, "m")),
+        (np.datetime64("1970-01-01T00:02"), "1970-01-01T00:04:00Z"),
+        (120, 240.0),
+    ],
+)
+def test_the_ends_of_a_quiet_time_are_instants_or_durations(span):
+    blocks = reduce_log(log({"N": 0.003}, duration="8min"))
+    chosen = given_quiescent_blocks(blocks, span)
+    inside = (blocks["begin"].values >= 120.0) & (blocks["end"].values <= 240.0)
+    np.testing.assert_array_equal(chosen, np.broadcast_to(inside, chosen.shape))
+    with pytest.raises(OptionError, match="neither a time nor a duration"):
+        given_quiescent_blocks(blocks, ("0s", "soon"))
 
 
 @pytest.mark.parametrize("block_count", [1, 2, 4, 15])

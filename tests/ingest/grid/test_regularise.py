@@ -385,6 +385,9 @@ def test_a_regular_log_passes_through():
     assert regularise(log, rate=100.0) is log
     with pytest.raises(OptionError, match=r"tool.csv is a regular log of 100 Hz, not of 200 Hz"):
         regularise(log, rate=200.0)
+    for wrong in ({"max_gap": "soon"}, {"limits": {"rows": 1}}):
+        with pytest.raises(OptionError, match=r"soon|rows"):
+            regularise(log, **wrong)
 
 
 def test_arrays_keep_every_bit():
