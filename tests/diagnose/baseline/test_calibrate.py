@@ -164,7 +164,7 @@ def test_given_quiet_time_is_used_and_checked():
     assert calibrate_noise(blocks, quiet=(0.0, 1200.0)).attrs["calibrated_on"] == [
         ["1970-01-01T00:00:00.000Z", "1970-01-01T00:20:00.000Z"]
     ]
-    with pytest.raises(OptionError, match="'soon' is not a date and time"):
+    with pytest.raises(OptionError, match="'soon' is neither a time nor a duration"):
         calibrate_noise(blocks, quiet=("soon", "later"))
 
 

@@ -176,8 +176,15 @@ def test_a_quiet_time_that_is_lost_is_ignored_with_a_note():
     assert baseline.attrs["calibrated_on"] == calibrate_noise(blocks).attrs["calibrated_on"]
 
 
-@pytest.mark.parametrize("quiet", [(4000.0, 5000.0), (-50.0, -10.0), (700.0, 100.0)])
-def test_a_quiet_time_outside_the_record_is_refused(quiet):
+@pytest.mark.parametrize(
+    ("quiet", "message"),
+    [
+        ((4000.0, 5000.0), "outside of the 1800 s of the record"),
+        ((700.0, 100.0), "outside of the 1800 s of the record"),
+        ((-50.0, -10.0), "-50.0 is neither a time nor a duration"),
+    ],
+)
+def test_a_quiet_time_outside_the_record_is_refused(quiet, message):
     blocks = reduce_log(log({"N": 0.003}, duration="30min"))
-    with pytest.raises(OptionError, match="outside of the 1800 s of the record"):
+    with pytest.raises(OptionError, match=message):
         calibrate_noise(blocks, quiet=quiet)

@@ -153,7 +153,7 @@ def test_an_effect_missing_in_the_model_is_named_and_explains_the_powers():
     assert abs(held["misfit_after"] - 1.0) < 0.5 * abs(held["misfit_before"] - 1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_low_pass_common_noise_is_not_a_filter():
     slow = {"name": "shared_source", "N": [0.0, 0.004, 0.004], "bandwidth": 0.8}
     model = {"noise": NOISE, "effect": [slow], "log": {"axes": ["x", "y", "z"]}}

@@ -176,7 +176,7 @@ def test_g_and_its_square_are_separated_by_what_one_explains_less(levels, nats, 
     assert ("g_sensitivity" in others) == is_open
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("table", "environment", "others"),
     [
@@ -185,23 +185,20 @@ def test_g_and_its_square_are_separated_by_what_one_explains_less(levels, nats, 
             "usual",
             {"temperature_bias", "thermal_hysteresis", "warm_up"},
         ),
-        pytest.param(
+        (
             {"name": "vibration_rectification", "sensitivity": 0.005, "axes": ["y"]},
             "usual",
             {"g_sensitivity"},
-            marks=pytest.mark.full,
         ),
-        pytest.param(
+        (
             {"name": "shared_source", "N": [0.0012, 0.0012, -0.0012], "axes": ["x", "y", "z"]},
             "usual",
             set(),
-            marks=pytest.mark.full,
         ),
-        pytest.param(
+        (
             {"name": "spikes", "per_hour": 100.0, "kind": "outlier", "size": 30.0, "axes": ["z"]},
             "usual",
             set(),
-            marks=pytest.mark.full,
         ),
     ],
     ids=lambda value: value["name"] if isinstance(value, dict) else None,

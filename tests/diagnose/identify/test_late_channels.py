@@ -73,7 +73,10 @@ def examined(log: xr.Dataset) -> tuple[Identifications, xr.Dataset, xr.Dataset]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("delay", "own_stamps"), [(DELAY, False), (-123.0, True)])
+@pytest.mark.parametrize(
+    ("delay", "own_stamps"),
+    [(DELAY, False), pytest.param(-123.0, True, marks=pytest.mark.full)],
+)
 def test_late_or_early_channel_is_found(delay: float, own_stamps: bool) -> None:
     record = examined(recorded([RECTIFIED], delay, own_stamps=own_stamps))
     found = find_late_channel(*record)
@@ -87,9 +90,9 @@ def test_late_or_early_channel_is_found(delay: float, own_stamps: bool) -> None:
 @pytest.mark.parametrize(
     ("effects", "delay", "world"),
     [
-        ([], DELAY, (SHAKEN,)),
+        pytest.param([], DELAY, (SHAKEN,), marks=pytest.mark.full),
         ([RECTIFIED], 0.0, (SHAKEN,)),
-        ([RECTIFIED], 400.0, (SHAKEN,)),
+        pytest.param([RECTIFIED], 400.0, (SHAKEN,), marks=pytest.mark.full),
         # the bias follows no channel
         ([{"name": "bias_jump", "axes": ["x"], "step": [0.2], "at": 450.0}], DELAY, (SHAKEN,)),
         ([{"name": "ageing_bias", "axes": ["x"], "slope": 20.0}], DELAY, (WARMING, SHAKEN)),

@@ -169,8 +169,8 @@ def test_axis_that_turns_without_a_channel_leaks_into_another():
     assert "z" in {axis for selection in identifications.unidentified for axis in selection.axes}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("error", [0.0, pytest.param(2e-4, marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("error", [0.0, 2e-4])
 def test_whole_rotation_is_the_only_effect(error: float):
     diagnosis = diagnose(_log_whole_rotation(2, error=error), nulls=100)
     (effect,) = diagnosis.effects
@@ -190,15 +190,8 @@ def test_tiny_share_of_the_rotation_is_a_scale_factor_error():
     assert np.isfinite(identification.evidence_nats)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("speed", "stick_slip"),
-    [
-        (90, 0.3),
-        pytest.param(90, 0.0, marks=pytest.mark.full),
-        pytest.param(720, 0.6, marks=pytest.mark.full),
-    ],
-)
+@pytest.mark.full
+@pytest.mark.parametrize(("speed", "stick_slip"), [(90, 0.3), (90, 0.0), (720, 0.6)])
 def test_earth_rate_is_the_only_effect_on_a_tool_that_starts_to_rotate(
     speed: float, stick_slip: float
 ):

@@ -51,7 +51,7 @@ def place(jitter, scatter, losses, unit, *, rate=100.0, rows=20_000, seed=0, **o
         # less of both is in `test_jitter_at_random_in_every_way`
         pytest.param("latest", 0.5, "bursts", "us", marks=pytest.mark.slow),
         pytest.param("packets", 0.3, "none", "us", marks=pytest.mark.full),
-        pytest.param("packets", 0.1, "bursts", "us", marks=pytest.mark.slow),
+        pytest.param("packets", 0.1, "bursts", "us", marks=pytest.mark.full),
         pytest.param("packets", 0.3, "single", "ms", marks=pytest.mark.full),
         pytest.param("late", 0.0, "none", "ms", marks=pytest.mark.full),
         ("late", 0.3, "single", "us"),
