@@ -26,7 +26,8 @@ DRAWS = 512
 MIN_WHITE_SHARE = 1e-3
 _MIN_DRAWN_SHARE = 0.01  # of the fitted N^2, in a draw: white noise is never absent; design choice
 _MIN_POWER_WITH_EFFECTS = 0.05  # of expected powers that fitted effects may leave; design choice
-_MIN_STEP = 1e-3  # shortest step towards the best fit
+_MAX_STEPS, _MIN_CHANGE = 50, 1e-9  # of a fit, and relative change of its powers in the last step
+_MIN_STEP = 1e-3  # shortest step towards the best fit, as a share of the whole
 _ROUNDING_SHARE = 1e-12  # rounding error of a log likelihood
 
 
@@ -106,53 +107,85 @@ def fit_squares(bands: BandPowers) -> tuple[Floats, Floats, Floats]:
     >>> fit_squares(bands)[0].round(6)
     array([0.1, 2. , 0. , 3. ])
     """
-    width = bands.columns.shape[1]
-    square, normal = np.zeros(width), np.zeros((width, width))
-    weighted_squares = bands.weight * bands.rest() / bands.columns[:, N_TERM]
-    square[N_TERM] = max(float(weighted_squares.sum() / bands.weight.sum()), 0.0)
-    spectrum = bands.columns @ square if bands.start is None else bands.start
     free_columns, precision = bands.free()
-    # Otherwise the likelihood is not that of these powers alone.
-    has_powers_only = (
-        not free_columns.shape[1] and bands.fixed_power is None and bands.start is None
-    )
-    for _ in range(50):
+    if not free_columns.shape[1] and bands.fixed_power is None and bands.start is None:
+        square, normal, spectrum = _fit_noise_alone(bands, bands.columns[None])
+        return square[0], normal[0], spectrum[0]
+    width = bands.columns.shape[1]
+    square, normal = _white_square(bands, bands.columns), np.zeros((width, width))
+    spectrum = bands.columns @ square if bands.start is None else bands.start
+    for _ in range(_MAX_STEPS):
         weight = bands.weight / spectrum**2
         normal, right, to_noise, to_right = _eliminate_free_sizes(
             free_columns, precision, bands.columns, bands.rest(), weight
         )
         solution = solve_nonnegative(normal, right)
-        next_spectrum = bands.columns @ solution
-        if free_columns.shape[1] or bands.fixed_power is not None:
-            power_of_effects = free_columns @ (to_right - to_noise @ solution)
-            next_spectrum = next_spectrum + (bands.power - bands.rest()) + power_of_effects
-            next_spectrum = np.maximum(next_spectrum, _MIN_POWER_WITH_EFFECTS * spectrum)
+        power_of_effects = free_columns @ (to_right - to_noise @ solution)
+        power_of_effects = power_of_effects + (bands.power - bands.rest())
+        next_spectrum = np.maximum(
+            bands.columns @ solution + power_of_effects, _MIN_POWER_WITH_EFFECTS * spectrum
+        )
         if not (next_spectrum > 0.0).all():
             break
-        fraction = _choose_step(bands, spectrum, next_spectrum) if has_powers_only else 1.0
-        square = square + fraction * (solution - square)
-        next_spectrum = spectrum + fraction * (next_spectrum - spectrum)
         change = np.abs(next_spectrum / spectrum - 1.0).max()
-        spectrum = next_spectrum
-        if change < 1e-9:
+        square, spectrum = solution, next_spectrum
+        if change < _MIN_CHANGE:
             break
     return square, normal, spectrum
 
 
-def _choose_step(bands: BandPowers, spectrum: Floats, next_spectrum: Floats) -> float:
-    """Return the step towards the next spectrum, halved until the likelihood does not fall."""
+def _white_square(bands: BandPowers, columns: Floats) -> Floats:
+    """Return squares (..., term) of white noise alone; columns (..., cell, term)."""
+    square = np.zeros((*columns.shape[:-2], columns.shape[-1]))
+    weighted_squares = bands.weight * bands.rest() / columns[..., N_TERM]
+    square[..., N_TERM] = np.maximum(weighted_squares.sum(axis=-1) / bands.weight.sum(), 0.0)
+    return square
+
+
+def _fit_noise_alone(bands: BandPowers, columns: Floats) -> tuple[Floats, Floats, Floats]:
+    """Fit the squares of noise without effects, for many sets of columns (set, cell, term) at once.
+
+    Without effects, the likelihood is that of these powers alone: each step is halved until the
+    likelihood does not fall.
+    """
+    square = _white_square(bands, columns)
+    normal = np.zeros((*square.shape, square.shape[-1]))
+    spectrum = np.einsum("ijk,ik->ij", columns, square)
+    open_sets = np.arange(len(columns))
+    for _ in range(_MAX_STEPS):
+        used, last = columns[open_sets], spectrum[open_sets]
+        weighted = np.swapaxes(used, 1, 2) * (bands.weight / last**2)[:, None, :]
+        normal[open_sets] = weighted @ used
+        solution = solve_nonnegative(normal[open_sets], weighted @ bands.power)
+        step = np.einsum("ijk,ik->ij", used, solution) - last
+        is_possible = (last + step > 0.0).all(axis=1)
+        fraction = np.where(is_possible, _choose_steps(bands, last, step), 0.0)[:, None]
+        square[open_sets] += fraction * (solution - square[open_sets])
+        spectrum[open_sets] += fraction * step
+        change = np.abs(fraction * step / last).max(axis=1)
+        open_sets = open_sets[change >= _MIN_CHANGE]
+        if not open_sets.size:
+            break
+    return square, normal, spectrum
+
+
+def _choose_steps(bands: BandPowers, spectrum: Floats, step: Floats) -> Floats:
+    """Return the share (set,) of a step (set, cell) with which the likelihood does not fall."""
     log_likelihood = _log_likelihood(bands, spectrum)
-    fraction = 1.0
-    while fraction > _MIN_STEP and _log_likelihood(
-        bands, spectrum + fraction * (next_spectrum - spectrum)
-    ) < log_likelihood - _ROUNDING_SHARE * abs(log_likelihood):
-        fraction *= 0.5
+    least = log_likelihood - _ROUNDING_SHARE * np.abs(log_likelihood)
+    fraction = np.ones(len(spectrum))
+    falls = np.ones(len(spectrum), np.bool_)
+    while falls.any():
+        with np.errstate(invalid="ignore", divide="ignore"):
+            reached = _log_likelihood(bands, spectrum + fraction[:, None] * step)
+        falls = (fraction > _MIN_STEP) & ~(reached >= least)
+        fraction[falls] *= 0.5
     return fraction
 
 
-def _log_likelihood(bands: BandPowers, spectrum: Floats) -> float:
-    """Return the gamma log likelihood of a spectrum."""
-    return -float((bands.weight * (np.log(spectrum) + bands.power / spectrum)).sum())
+def _log_likelihood(bands: BandPowers, spectrum: Floats) -> Floats:
+    """Return the gamma log likelihood (...) of spectra (..., cell)."""
+    return np.asarray(-(bands.weight * (np.log(spectrum) + bands.power / spectrum)).sum(axis=-1))
 
 
 def _eliminate_free_sizes(
@@ -187,31 +220,31 @@ def fit_filter_response(
         band_response(LoggerFilter.example(**values), blocks)
         for values in LoggerFilter.example().points(make_windows(blocks, {}))
     ]
-    behind = [
-        [fit_behind(bands, bands.columns * response) for bands in bands_by_axis]
-        for response in responses
-    ]
-    chosen = choose_filter(behind, settings)
-    is_better = [
-        nats > fit_behind(bands, bands.columns)[0] + settings.ambiguous_nats
-        for bands, (nats, _) in zip(bands_by_axis, behind[chosen], strict=True)
-    ]
-    return responses[chosen] if all(is_better) else None
+    nats, quantization = [], []
+    for bands in bands_by_axis:
+        square, _, expected = _fit_noise_alone(
+            bands, bands.columns * np.stack([np.ones_like(responses[0]), *responses])
+        )
+        nats.append(_log_likelihood(bands, expected))
+        quantization.append(square[1:, 0])
+    nats_without, nats_behind = np.split(np.array(nats), [1], axis=1)
+    chosen = choose_filter(nats_behind.sum(axis=0), np.sum(quantization, axis=0), settings)
+    is_better = nats_behind[:, chosen] > nats_without[:, 0] + settings.ambiguous_nats
+    return responses[chosen] if is_better.all() else None
 
 
 def fit_behind(bands: BandPowers, columns: Floats) -> tuple[float, float]:
     """Return the largest log likelihood of powers over noise of these columns, and its Q^2."""
     square, _, expected = fit_squares(bands._replace(columns=columns))
-    return _log_likelihood(bands, expected), float(square[0])
+    return float(_log_likelihood(bands, expected)), float(square[0])
 
 
-def choose_filter(behind: Sequence[Sequence[tuple[float, float]]], settings: Settings) -> int:
+def choose_filter(likelihood: Floats, quantization: Floats, settings: Settings) -> int:
     """Return the place of the filter with the least Q^2 among those that fit about as well.
 
-    `behind` has the results of `fit_behind` for each filter and axis. Q rises where a low-pass
+    The log likelihood and Q^2 of each filter are sums over the axes. Q rises where a low-pass
     falls, so that one at too low a cutoff fits with much Q.
     """
-    likelihood, quantization = np.array(behind).sum(axis=1).T
     is_close = likelihood > likelihood.max() - settings.ambiguous_nats
     return int(np.where(is_close, quantization, np.inf).argmin())
 

@@ -58,8 +58,8 @@ def fit_filter_sizes(
     ]
     family += _best_sizes(family, likelihood)
     behind = [fit_all(values) for values in family]
-    log = [sum(nats for nats, _ in axes) for axes in behind]
-    best = family[choose_filter(behind, state.settings)]
+    log, quantization = np.array(behind).sum(axis=1).T
+    best = family[choose_filter(log, quantization, state.settings)]
     name = "cutoff" if best["cutoff"] else "length"
     other_values = {key: float(value) for key, value in best.items() if key != name}
     if name == "length" and best["instrument"] == 1.0:

@@ -14,7 +14,7 @@ from gyrostab.diagnose.baseline.expected_statistics import (
     reduced_shape,
     white_variance,
 )
-from gyrostab.diagnose.baseline.posterior import BandPowers, fit_squares
+from gyrostab.diagnose.baseline.posterior import BandPowers, _fit_noise_alone, fit_squares
 from gyrostab.diagnose.baseline.quiescent import find_quiescent_blocks
 from gyrostab.diagnose.evidence.wandering import no_processes
 from gyrostab.diagnose.nulls.records import null_records
@@ -202,6 +202,22 @@ def test_fit_maximises_the_likelihood_even_without_a_good_fit():
     )
     square, *_ = fit_squares(bands)
     assert worse(np.log(np.maximum(square, 1e-12))) < best + 0.1
+
+
+def test_a_fit_does_not_depend_on_those_beside_it():
+    """Some need a few steps and others many."""
+    rng = np.random.default_rng(2)
+    f = np.geomspace(0.05, 5.0, 14)
+    columns = np.stack([f**2, np.ones(14), 1.0 / f, f**-2], axis=1)
+    low_pass = 1.0 / (1.0 + (f / np.array([[0.2], [0.5], [2.0], [9.0]])) ** 4)
+    sets = np.concatenate([columns[None], columns * low_pass[:, :, None]])
+    shape = np.full(14, 40.0)
+    power = sets[2] @ [0.0, 2.0, 0.3, 0.0] * rng.gamma(shape) / shape
+    together = _fit_noise_alone(BandPowers(power, columns, shape), sets)
+    for place, own in enumerate(sets):
+        alone = fit_squares(BandPowers(power, own, shape))
+        for part, one in zip(together, alone, strict=True):
+            np.testing.assert_allclose(part[place], one, rtol=1e-12)
 
 
 # --------------------------------------------------------------------------------
