@@ -45,8 +45,8 @@ def fit_noise(
     Parameters
     ----------
     surface : xarray.Dataset
-        Surface of `gyrostab.davar`, or some of its axes, windows or averaging times; a lazy one
-        stays lazy, but for the search of a filter.
+        Surface of `gyrostab.davar`, or some of its axes, windows or averaging times. A lazy surface
+        stays lazy; only the search for a filter computes parts of it.
     terms : str or iterable of str
         Terms to fit, a selection of Q, N, B, K, R; the others are taken as zero.
     tau_min, tau_max : float or str, optional
