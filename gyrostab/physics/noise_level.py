@@ -331,8 +331,8 @@ class VibrationNoise(_FollowsVibration):
             return None
         from gyrostab.kernels.random.coloured import begin_process, mount
 
-        reading = mount(self.resonance, self.quality, setup.rate)
-        return [begin_process(reading, own) for own in rng.spawn(len(setup.axes))]
+        transition = mount(self.resonance, self.quality, setup.rate)
+        return [begin_process(transition, own) for own in rng.spawn(len(setup.axes))]
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Floats], Any]:
         if not self.resonance:

@@ -103,7 +103,7 @@ def _integrate_moments(a: Floats, b: Floats, c: Floats, rate: float) -> tuple[Fl
     return step[size, :size], scale * step @ exponential[: size + 1, size + 1 :]
 
 
-def _make_reading(
+def _make_transition(
     a: Floats, b: Floats, covariance: Floats, c: Floats, rate: float, *, average: bool
 ) -> Transition:
     """Sample a stationary process with state matrix `a` [s-1] and the output `c` at `rate` [Hz].
@@ -151,7 +151,7 @@ def oscillator(
     omega = 2.0 * math.pi * frequency
     a, _, c = _chain_sections([_Section(omega, omega / quality, True)])
     b = np.array([0.0, math.sqrt(2.0 * omega / quality)])
-    return _make_reading(a, b, np.eye(2), c, rate, average=average)
+    return _make_transition(a, b, np.eye(2), c, rate, average=average)
 
 
 def mount(resonance: float, quality: float, rate: float, *, average: bool = True) -> Transition:
@@ -171,7 +171,7 @@ def mount(resonance: float, quality: float, rate: float, *, average: bool = True
     omega = 2.0 * math.pi * resonance
     a, b, c = _chain_sections([_Section(omega, omega / quality, False)])
     covariance: Floats = np.asarray(solve_continuous_lyapunov(a, -np.outer(b, b)), np.float64)
-    return _make_reading(a, b, covariance, c, rate, average=average)
+    return _make_transition(a, b, covariance, c, rate, average=average)
 
 
 def _band_sections(low: float, high: float) -> list[_Section]:
@@ -225,27 +225,29 @@ def band(
         b[end - 1] /= scale
     covariance = solve_continuous_lyapunov(a, -np.outer(b, b))
     power = covariance[size - 1, size - 1]  # of the band before the mount
-    return _make_reading(a, b / math.sqrt(power), covariance / power, c, rate, average=average)
+    return _make_transition(a, b / math.sqrt(power), covariance / power, c, rate, average=average)
 
 
 class Process(NamedTuple):
-    """A process at one sample: its reading, random numbers, and state (d,)."""
+    """A process at one sample: its transition, random numbers, and state (d,)."""
 
-    reading: Transition
+    transition: Transition
     rng: np.random.Generator
     position: Floats
 
 
-def begin_process(reading: Transition, rng: np.random.Generator) -> Process:
+def begin_process(transition: Transition, rng: np.random.Generator) -> Process:
     """Draw a state of the stationary process."""
-    return Process(reading, rng, reading.spread @ rng.standard_normal(reading.read.size))
+    return Process(transition, rng, transition.spread @ rng.standard_normal(transition.read.size))
 
 
 def read_process(process: Process, size: int) -> tuple[Floats, Process]:
     """Read the process at the next `size` samples; return also what follows them."""
-    reading, rng, position = process
+    transition, rng, position = process
     normal = rng.standard_normal((size, position.size + 1))
-    values, position = _read_samples(reading.step, reading.read, reading.kick, normal, position)
+    values, position = _read_samples(
+        transition.step, transition.read, transition.kick, normal, position
+    )
     return values, process._replace(position=position)
 
 
