@@ -57,7 +57,7 @@ def _number_columns(designs: Sequence[Floats]) -> list[Ints]:
 
 def mean_residual(data: xr.Dataset, baseline: xr.Dataset, axis: str) -> Floats:
     """Return the block means of an axis less those of known effects, (block, record)."""
-    mean = data.variables["mean"].isel(axis=data["axis"].values.tolist().index(axis))
+    mean = data.variables["mean"].isel(axis=data.variables["axis"].values.tolist().index(axis))
     by_record = mean.transpose("block", ...).values.reshape(data.sizes["block"], -1)
     return np.asarray(by_record - axis_values(baseline, "known_mean", axis)[:, None])
 
@@ -108,7 +108,7 @@ def mean_factors(
     numbers, design_width = _number_columns(flat), columns.shape[1] - columns_given.shape[1]
     present = np.asarray(np.isfinite(values).all(axis=1))
     setup = axis_noise(baseline, axis) | {
-        "step": float(data["end"].values[0] - data["begin"].values[0]),
+        "step": float(data.variables["end"].values[0] - data.variables["begin"].values[0]),
         "pairs": column_pairs(columns.shape[1], numbers, columns_given.shape[1]),
     }
     if wander is not None:

@@ -147,7 +147,7 @@ def mean_products(
         if pairs is None:
             gram[g] = x.T @ x
         else:
-            products = row_products(np.ascontiguousarray(whitened.T), *pairs)
+            products = row_products(np.ascontiguousarray(x.T), *pairs)
             gram[g][pairs] = gram[g][pairs[::-1]] = products
     return Products(square, cross, gram, determinant)
 
@@ -221,11 +221,9 @@ def log_evidence(
     """
     bounded = np.array(is_bounded, np.bool_) if len(is_bounded) else np.zeros(len(designs), bool)
     weight = log_weight - np.logaddexp.reduce(log_weight)
-    base = np.ascontiguousarray(
-        (weight[:, None] - 0.5 * (products.square + products.log_determinant[:, None])).T
-    )
-    out = np.empty((1 + len(designs), base.shape[0]))
-    out[0] = np.logaddexp.reduce(base, axis=1)
+    base = weight[:, None] - 0.5 * (products.square + products.log_determinant[:, None])
+    out = np.empty((1 + len(designs), base.shape[1]))
+    out[0] = np.logaddexp.reduce(base, axis=0)
     at_once = max(1, _MAX_PRODUCTS_AT_ONCE // max(base.size, 1))
     sizes = np.array([chosen.size for chosen in designs], np.int64)
     for size, bound in sorted({*zip(sizes.tolist(), bounded.tolist(), strict=True)}):
@@ -260,12 +258,7 @@ def _equal_size_evidence(
     squares = np.maximum(eigenvalues, 0.0)
     if is_bounded:
         return _bounded_evidence(base, rotated, squares, vectors, widths)
-    return mixed_evidence(
-        base,
-        np.ascontiguousarray(rotated.transpose(1, 3, 0, 2)),
-        np.ascontiguousarray(squares.swapaxes(0, 1)),
-        np.square(widths),
-    )
+    return mixed_evidence(base, rotated, squares, np.square(widths))
 
 
 def _bounded_evidence(
@@ -286,7 +279,7 @@ def _bounded_evidence(
     mean = vectors @ (variance[..., None] * rotated)
     sd = np.sqrt(np.einsum("gdij,wgdj->wgdi", np.square(vectors), variance))
     terms = (
-        base.T[:, None]
+        base[:, None]
         - 0.5 * np.log(spread).sum(axis=3)[..., None]
         + 0.5 * (variance[..., None] * rotated**2).sum(axis=3)
         + (log_ndtr(mean / sd[..., None]) + np.log(2.0)).sum(axis=3)

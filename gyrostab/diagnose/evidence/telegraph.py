@@ -340,14 +340,13 @@ def course_evidence(
     `scatter`, and its square, `unit`, are relative to the white variance; the latter is the scale
     of the prior of the step (`WIDTHS`).
     """
-    base = (log_weight - 0.5 * (products.square[:, place] + products.log_determinant))[None]
+    base = (log_weight - 0.5 * (products.square[:, place] + products.log_determinant))[:, None]
     size = 1.0 / np.sqrt(max(unit + scatter, 1e-300))
-    rotated = np.ascontiguousarray((products.cross[:, place, place] * size)[None, None, :, None])
-    eigenvalues = np.maximum((products.gram[:, place, place] + scatter) * size**2, 0.0)[
-        None, :, None
-    ]
+    rotated = (products.cross[:, place, place] * size)[:, None, None, None]
+    eigenvalues = np.maximum((products.gram[:, place, place] + scatter) * size**2, 0.0)
+    eigenvalues = eigenvalues[:, None, None]
     two = float(mixed_evidence(base, rotated, eigenvalues, np.square(WIDTHS))[0, 0])
-    return float(np.logaddexp.reduce(base[0])), two
+    return float(np.logaddexp.reduce(base[:, 0])), two
 
 
 class Visits(NamedTuple):

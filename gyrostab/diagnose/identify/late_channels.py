@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -12,10 +13,11 @@ import xarray as xr
 from scipy.special import ndtr, ndtri
 
 from gyrostab.arrays import Floats, Ints
-from gyrostab.diagnose.identify.components import sum_evidence
+from gyrostab.diagnose.identify.components import group_components, sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.identify.selections import Selection
+from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.windows import channel_units
 from gyrostab.diagnose.reduce.log_blocks import channel_means, is_rms_channel
@@ -183,32 +185,53 @@ class DelaySearch:
 
         With `wrap`, the channel moves round the record, end to start.
         """
-        blocks = self.examination.start.blocks.drop_vars(f"fine_{channel}", errors="ignore")
-        name = f"channel_{channel}"
-        places = np.arange(parts.size)
-        best = []
-        for shift in shifts:
-            later = (places + shift) % parts.size if wrap else places + shift
-            inside = (later >= 0) & (later < parts.size)
-            in_parts = np.where(inside, parts[np.clip(later, 0, parts.size - 1)], np.nan)
-            good = np.isfinite(in_parts).reshape(-1, _PARTS)
-            sums = np.nansum(in_parts.reshape(-1, _PARTS), axis=1)
-            means = sums / np.where(good.any(axis=1), good.sum(axis=1), np.nan)
-            values = np.sqrt(means) if is_rms_channel(channel) else means
-            candidates, _ = effect_candidates(
-                blocks.assign({name: ("block", values, blocks[name].attrs)}),
-                self.baseline["coefficient"],
-                channel=channel,
-                settings=self.state.settings,
-            )
-            followers = [
-                candidate
-                for candidate in candidates
-                if candidate.statistic.is_linear_in_means or candidate.statistic.is_power
+        by_shift = [self._find_followers(channel, parts, shift, wrap=wrap) for shift in shifts]
+        owner = {
+            id(candidate): place
+            for place, followers in enumerate(by_shift)
+            for candidate in followers
+        }
+        settings = self.state.settings
+        grouped: list[list[CandidateEvidence]] = [[] for _ in by_shift]
+        # of all shifts together, so that the noise is whitened once for many designs
+        for evidence in self.examination.compute_evidence(list(chain(*by_shift)), self.state):
+            grouped[owner[id(evidence.candidate)]].append(evidence)
+        return np.array(
+            [
+                max(
+                    map(sum_evidence, group_components(of_shift, settings=settings).values()),
+                    default=0.0,
+                )
+                for of_shift in grouped
             ]
-            components = self.examination.find_components(followers, self.state)
-            best.append(max(map(sum_evidence, components.values()), default=0.0))
-        return np.array(best)
+        )
+
+    def _find_followers(
+        self, channel: str, parts: Floats, shift: int, *, wrap: bool
+    ) -> list[Candidate]:
+        """Return the candidates in means and powers that follow a channel moved by parts."""
+        blocks = self.examination.start.blocks.drop_vars(f"fine_{channel}", errors="ignore")
+        places = np.arange(parts.size) + shift
+        if wrap:
+            places %= parts.size
+        inside = (places >= 0) & (places < parts.size)
+        in_parts = np.where(inside, parts[np.clip(places, 0, parts.size - 1)], np.nan)
+        good = np.isfinite(in_parts).reshape(-1, _PARTS)
+        sums = np.nansum(in_parts.reshape(-1, _PARTS), axis=1)
+        means = sums / np.where(good.any(axis=1), good.sum(axis=1), np.nan)
+        values = np.sqrt(means) if is_rms_channel(channel) else means
+        name = f"channel_{channel}"
+        candidates, _ = effect_candidates(
+            blocks.assign({name: ("block", values, blocks[name].attrs)}),
+            self.baseline["coefficient"],
+            channel=channel,
+            settings=self.state.settings,
+        )
+        return [
+            candidate
+            for candidate in candidates
+            if candidate.statistic.is_linear_in_means or candidate.statistic.is_power
+        ]
 
 
 def _correlate_with_itself(parts: Floats, shifts: Ints) -> Floats:

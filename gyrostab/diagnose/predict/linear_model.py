@@ -81,7 +81,7 @@ class State:
     @property
     def axes(self) -> list[str]:
         """Names of the axes."""
-        return [str(axis) for axis in self.blocks["axis"].values]
+        return [str(axis) for axis in self.blocks.variables["axis"].values]
 
 
 def initial_state(
@@ -131,7 +131,7 @@ def spread_by_gaps(density: Array, blocks: xr.Dataset, row: str = "axis") -> Arr
 
 def band_widths(blocks: xr.Dataset) -> Array:
     """Return the widths of the bands [Hz]."""
-    return np.asarray(blocks["band_high"].values - blocks["band_low"].values)
+    return np.asarray(blocks.variables["band_high"].values - blocks.variables["band_low"].values)
 
 
 def average_in_bands(density: Array, blocks: xr.Dataset) -> Array:

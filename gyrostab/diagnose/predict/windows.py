@@ -37,7 +37,7 @@ _SIDE_BLOCKS = (2, 8, 32)  # blocks on either side that define a step; design ch
 def channel_units(blocks: xr.Dataset) -> dict[str, str]:
     """Return the units of the channels of the log."""
     return {
-        name.removeprefix("channel_"): str(blocks[name].attrs.get("units", ""))
+        name.removeprefix("channel_"): str(blocks.variables[name].attrs.get("units", ""))
         for name in map(str, blocks.data_vars)
         if name.startswith("channel_")
     }
@@ -48,50 +48,51 @@ def make_windows(blocks: xr.Dataset, drivers: Mapping[str, str]) -> Windows:
 
     `drivers` has the channels of the log by channel of the effect.
     """
-    axes = tuple(str(axis) for axis in blocks["axis"].values)
+    variables = blocks.variables  # without coordinates, which take most of the time of a search
+    axes = tuple(str(axis) for axis in variables["axis"].values)
     means = dict(
         zip(axes, map(fill_linearly, read_as_measured(blocks, "mean").values), strict=True)
     )
 
     def spans(name: str) -> Array:
         return np.stack(
-            [blocks[f"{name}_begin"].values, blocks[f"{name}_end"].values], axis=1
+            [variables[f"{name}_begin"].values, variables[f"{name}_end"].values], axis=1
         ).astype(np.float64)
 
     return Windows(
-        begin=blocks["begin"].values.astype(np.float64),
-        end=blocks["end"].values.astype(np.float64),
-        frequency=blocks["frequency"].values,
+        begin=variables["begin"].values.astype(np.float64),
+        end=variables["end"].values.astype(np.float64),
+        frequency=variables["frequency"].values,
         rate=float(blocks.attrs["sampling_rate_hz"]),
         axes=axes,
         drivers={
-            inner: fill_linearly(blocks[f"channel_{name}"].values)
+            inner: fill_linearly(variables[f"channel_{name}"].values)
             for inner, name in drivers.items()
         },
         fine={
-            inner: blocks[f"fine_{name}"].values
+            inner: variables[f"fine_{name}"].values
             for inner, name in drivers.items()
-            if f"fine_{name}" in blocks
+            if f"fine_{name}" in variables
         },
         own=means,
         gaps=spans("gap"),
         restarts=spans("restart"),
         phase=(np.arange(blocks.sizes["phase"]) + 0.5) / blocks.sizes["phase"]
-        if "profile" in blocks
+        if "profile" in variables
         else np.empty(0),
-        turns=blocks["ramp_turns"].values if "ramp_turns" in blocks else np.empty(0),
-        turn_means=dict(zip(axes, blocks["turn_mean"].values, strict=True))
-        if "turn_mean" in blocks and drivers.get("rotation_rate") == "rotation_rate"
+        turns=variables["ramp_turns"].values if "ramp_turns" in variables else np.empty(0),
+        turn_means=dict(zip(axes, variables["turn_mean"].values, strict=True))
+        if "turn_mean" in variables and drivers.get("rotation_rate") == "rotation_rate"
         else {},
         bands={
             inner: band
             for inner, name in drivers.items()
-            if (band := _rms_band(blocks[f"channel_{name}"])) is not None
+            if (band := _rms_band(variables[f"channel_{name}"])) is not None
         },
     )
 
 
-def _rms_band(channel: xr.DataArray) -> tuple[float, float] | None:
+def _rms_band(channel: xr.Variable) -> tuple[float, float] | None:
     """Return the edges of the band of an rms channel [Hz]; None if it does not have any."""
     try:
         low, high = (float(edge) for edge in channel.attrs.get("band_hz", ()))
@@ -120,12 +121,13 @@ def predict_exogenous(effect: Effect, windows: Windows) -> Prediction:
         for name, values in full.mean.items()
     }
     nothing = np.full(windows.begin.size, np.nan)
-    without_means = effect.explain(replace(windows, own=dict.fromkeys(windows.axes, nothing))).mean
+    one_band = replace(windows, frequency=windows.frequency[:1])  # the means do not depend on it
+    without_means = effect.explain(replace(one_band, own=dict.fromkeys(windows.axes, nothing))).mean
     for name, values in mean.items():
         if name in without_means and np.isfinite(without_means[name]).all():
             continue
         for row, axis in enumerate(windows.axes):
-            blind = replace(windows, own=dict(windows.own) | {axis: nothing})
+            blind = replace(one_band, own=dict(windows.own) | {axis: nothing})
             without_axis = np.broadcast_to(np.atleast_2d(effect.explain(blind).mean[name]), shape)[
                 row
             ]

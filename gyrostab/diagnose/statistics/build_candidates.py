@@ -135,7 +135,7 @@ def _matching_channels(
         name
         for name in names
         if units.get(name) == unit
-        and np.isfinite(blocks[f"channel_{name}"].values).mean() >= MIN_BLOCK_SHARE
+        and np.isfinite(blocks.variables[f"channel_{name}"].values).mean() >= MIN_BLOCK_SHARE
     ]
 
 

@@ -102,7 +102,7 @@ class Power(Statistic):
 
         Constant coherent densities are left to the cross-spectra.
         """
-        frequency = prospect.blocks["frequency"].values
+        frequency = prospect.blocks.variables["frequency"].values
         rate = float(prospect.blocks.attrs["sampling_rate_hz"])
         level: dict[str, Floats] = {}
         for (symbol, name), share in prospect.prediction.level.items():
