@@ -95,12 +95,14 @@ class AxisMeans(NamedTuple):
 
     def _negative_likelihood(self, points: Floats) -> Floats:
         """Return it for log K, log B and perhaps the log variance of the angle of every point."""
-        out = []
-        for point in points:
-            means = self._with_angle(point[2]) if point.size > 2 else self
-            K, B = np.exp(point[:2, None])
-            out.append(-means.log_likelihood(K, B)[0])
-        return np.array(out)
+        K, B = np.exp(points[:, :2].T)
+        if points.shape[1] == 2:
+            return -self.log_likelihood(K, B)
+        out = np.empty(len(points))
+        for angle in np.unique(points[:, 2]):
+            same = points[:, 2] == angle
+            out[same] = -self._with_angle(angle).log_likelihood(K[same], B[same])
+        return out
 
 
 def maximise_likelihood(

@@ -258,7 +258,7 @@ def _equal_size_evidence(
     squares = np.maximum(eigenvalues, 0.0)
     if is_bounded:
         return _bounded_evidence(base, rotated, squares, vectors, widths)
-    return mixed_evidence(base, rotated, squares, np.square(widths))
+    return np.asarray(mixed_evidence(base, rotated, squares, np.square(widths)))
 
 
 def _bounded_evidence(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -120,19 +120,24 @@ def predict_exogenous(effect: Effect, windows: Windows) -> Prediction:
         name: np.array(np.broadcast_to(np.atleast_2d(values), shape))
         for name, values in full.mean.items()
     }
-    nothing = np.full(windows.begin.size, np.nan)
-    one_band = replace(windows, frequency=windows.frequency[:1])  # the means do not depend on it
-    without_means = effect.explain(replace(one_band, own=dict.fromkeys(windows.axes, nothing))).mean
-    for name, values in mean.items():
-        if name in without_means and np.isfinite(without_means[name]).all():
-            continue
+    # the means depend neither on the bands nor on the phase of the ramp
+    fewer = replace(windows, frequency=windows.frequency[:1], phase=np.empty(0))
+
+    def explain_without(axes: Iterable[str]) -> Mapping[str, Array]:
+        missing = dict.fromkeys(axes, np.full(windows.begin.size, np.nan))
+        return effect.explain(replace(fewer, own=dict(windows.own) | missing)).mean
+
+    without_any = explain_without(windows.axes)
+    following = [
+        name for name in mean if name not in without_any or not np.isfinite(without_any[name]).all()
+    ]
+    if following:
         for row, axis in enumerate(windows.axes):
-            blind = replace(one_band, own=dict(windows.own) | {axis: nothing})
-            without_axis = np.broadcast_to(np.atleast_2d(effect.explain(blind).mean[name]), shape)[
-                row
-            ]
-            if not np.array_equal(without_axis, values[row]):
-                values[row] = 0.0
+            without_axis = explain_without([axis])
+            for name in following:
+                expected = np.broadcast_to(np.atleast_2d(without_axis[name]), shape)[row]
+                if not np.array_equal(expected, mean[name][row]):
+                    mean[name][row] = 0.0
     return replace(full, mean=mean)
 
 
