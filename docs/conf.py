@@ -35,7 +35,7 @@ napoleon_use_rtype = False
 intersphinx_mapping = {}  # the build needs no network
 
 html_static_path = ["_static"]
-html_css_files = ["wrap.css"]
+html_css_files = ["site.css"]
 html_theme = "pydata_sphinx_theme"
 html_title = "gyrostab"
 html_show_sourcelink = False

@@ -98,6 +98,18 @@ def command(entry):
     return shlex.join(words)
 
 
+def break_command(text):
+    """Break a command of an indented block before options, into lines of at most 96 columns."""
+    line, *options = text.replace(" --", "\n--").split("\n")
+    lines = [line]
+    for option in options:
+        if len(lines[-1]) + len(option) < 94:
+            lines[-1] += f" {option}"
+        else:
+            lines.append(f"    {option}")
+    return " \\\n    ".join(lines)
+
+
 def describe(name, entry, folder):
     """Process one recording: its table row, its section, and its rows of the temperature table."""
     log, product, results = examine(entry, Path(folder, f"{name}.nc"))
@@ -120,7 +132,7 @@ def describe(name, entry, folder):
     }
     about |= {
         "text": entry["text"].format_map(results | {"refusal": refusal(entry)}),
-        "command": command(entry),
+        "command": break_command(command(entry)),
         "notes": notes,
     }
     windows = (
