@@ -14,17 +14,12 @@ export PYTHONDONTWRITEBYTECODE =
 # One file of tests stays on one worker, with what its tests share; files start in their order.
 PYTEST := -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo docs test test-slow test-install test-full test-minimum fuzz lint bench prove prove-quick real-recordings interop baseline clean-kernels clean help
+.PHONY: demo docs test test-slow test-install test-full test-minimum fuzz lint bench prove prove-quick real-recordings interop baseline clean help
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*## /\t/' | expand -t 18
 
-# numba does not notice that a function has changed which others inline: after a pull, compile all anew.
-$(VENV)/.kernels: $(shell find gyrostab/kernels -name '*.py')
-	find gyrostab -name '*.nb[ic]' -delete
-	mkdir -p $(VENV) && touch $@
-
-$(VENV)/.installed: pyproject.toml | $(VENV)/.kernels
+$(VENV)/.installed: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -e .
 	touch $@
@@ -52,7 +47,7 @@ test-install: $(VENV)/.installed-test  ## the README in a fresh checkout, and th
 test-full: $(VENV)/.installed-test  ## all tests: also whole diagnoses and calibrations, and more random examples
 	$(BIN)/python $(PYTEST) -m "" --hypothesis-profile full
 
-$(VENV)-minimum/.installed: pyproject.toml tests/support/minimum_versions.py | $(VENV)/.kernels
+$(VENV)-minimum/.installed: pyproject.toml tests/support/minimum_versions.py
 	test -x $(VENV)-minimum/bin/python || $(PYTHON) -m venv $(VENV)-minimum
 	$(PYTHON) -m tests.support.minimum_versions > $(VENV)-minimum/constraints.txt
 	$(VENV)-minimum/bin/pip install --quiet --disable-pip-version-check --prefer-binary -c $(VENV)-minimum/constraints.txt -e ".[test]"
@@ -100,8 +95,6 @@ interop: $(VENV)/.installed-test  ## open the files in other installed programs 
 baseline: $(VENV)/.installed-test  ## write the reference pictures of the figures again; inspect them afterwards
 	$(BIN)/python -m tests.plot.test_figures
 
-clean-kernels:  ## delete the compiled kernels
+clean:  ## delete what the targets made
 	find gyrostab -name '*.nb[ic]' -delete
-
-clean: clean-kernels  ## delete what the targets made
 	rm -rf $(VENV) $(VENV)-minimum $(OUT)

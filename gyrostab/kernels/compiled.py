@@ -7,9 +7,37 @@ other kernels call needs neither.
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Any
 
 from numba import njit
+
+
+def delete_stale_code(folder: Path) -> None:
+    """Delete the compiled code next to the sources in a folder, if any of them has changed.
+
+    numba compiles a function again if its own file has changed, but not if only that of a function
+    that it calls has: after an update, results would be those of neither version. What the sources
+    were is noted in ``__pycache__/sources.txt``.
+    """
+    sources = [(path, path.stat()) for path in sorted(folder.rglob("*.py"))]
+    state = "".join(
+        f"{path.relative_to(folder).as_posix()} {stat.st_mtime_ns} {stat.st_size}\n"
+        for path, stat in sources
+    )
+    note = folder / "__pycache__" / "sources.txt"
+    try:
+        if note.exists() and note.read_text(encoding="utf-8") == state:
+            return
+        for compiled in folder.rglob("*.nb[ic]"):
+            compiled.unlink(missing_ok=True)
+        note.parent.mkdir(exist_ok=True)
+        part = note.with_suffix(f".{os.getpid()}")
+        part.write_text(state, encoding="utf-8")
+        part.replace(note)
+    except OSError:  # nobody may write here, and numba keeps its code elsewhere
+        return
 
 
 def _has_cache() -> bool:
@@ -26,6 +54,7 @@ def _has_cache() -> bool:
     return True
 
 
+delete_stale_code(Path(__file__).parent)
 #: Options of a function that Python calls. A division by zero gives infinity or NaN; a test for it
 #: would prevent vectorisation. A literal integer in a call, such as 0, makes numba compile the
 #: callee again for this number; `np.int64(0)` does not.
