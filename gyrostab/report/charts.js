@@ -14,7 +14,6 @@
       const half = { nticks: 2, domain: [spread(from), spread(to)], tickfont: { size: 12 } };
       Object.assign(layout[name], { tickangle: 0 }, to - from < 0.6 ? half : { nticks: 3 });
     }
-    if (layout.scene) layout.scene.yaxis.dtick = 1;
     const scales = [...data, layout.coloraxis ?? {}].filter((item) => item.colorbar);
     for (const { colorbar } of scales) {
       const title = { ...colorbar.title, side: "top" };

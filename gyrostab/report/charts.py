@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.arrays import Floats
+from gyrostab.arrays import Array, Floats
 from gyrostab.plot.style import unit_label
 from gyrostab.time.stamps import to_nanoseconds
 
@@ -129,9 +129,22 @@ def log_axis(title: str, values: Floats, *, labels: int = 12, **options: Any) ->
     return {"type": "log", "title": title_, "tickformat": "~g", "dtick": step, **options}
 
 
+def to_milliseconds(nanoseconds: Array) -> Floats:
+    """Return times as plotly counts them [ms since 1970], from nanoseconds.
+
+    They have a fraction: plotly takes a whole number of four digits for a year.
+
+    Examples
+    --------
+    >>> to_milliseconds(np.array([5_000_000_000]))
+    array([5000.001])
+    """
+    return np.asarray(nanoseconds / 1e6 + 1e-3)
+
+
 def milliseconds(product: xr.Dataset) -> Floats:
     """Return window centres as plotly counts them [ms since 1970]."""
-    return np.asarray(to_nanoseconds(product["time"].values) / 1e6)
+    return to_milliseconds(to_nanoseconds(product["time"].values))
 
 
 def single(values: Any) -> NDArray[np.float32]:

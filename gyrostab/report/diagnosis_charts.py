@@ -25,6 +25,7 @@ from gyrostab.report.charts import (
     plain_text,
     single,
     stacked_panels,
+    to_milliseconds,
 )
 from gyrostab.report.static import static_png
 
@@ -105,7 +106,7 @@ def _centre_stamps(surfaces: xr.Dataset, content: Mapping[str, Any], kind: str =
     """Return the centres of windows, or with "block_" of blocks [ms since 1970]."""
     start = np.datetime64(content["recording"]["start"].removesuffix("Z"), "ns").astype(np.int64)
     seconds = (surfaces[f"{kind}begin"].values + surfaces[f"{kind}end"].values) / 2.0
-    return np.asarray(start / 1e6 + 1e3 * seconds)
+    return to_milliseconds(start + 1e9 * seconds)
 
 
 def draw_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
@@ -137,7 +138,8 @@ def draw_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
         for region in _find_regions(content, name, over_tau=True):
             _frame_region(frame, region, row)
     figure = new_chart(
-        height=170 * len(names) + 110,
+        height=170 * len(names) + 130,
+        margin={"l": 70, "r": 20, "t": 50, "b": 50},  # room for the buttons above the colour scale
         plot_bgcolor="#e8e8e8",
         coloraxis={
             "colorscale": CHANGE_CMAP, "cmin": -1, "cmax": 1,

@@ -304,7 +304,7 @@ def _draw_surface(product: xr.Dataset) -> go.Figure:
     figure = new_chart(
         scene={
             "xaxis": {"title": {"text": f"time [{unit}]"}},
-            "yaxis": log_axis(TAU_LABEL, product["tau"].values),
+            "yaxis": log_axis(TAU_LABEL, product["tau"].values, labels=5),
             "zaxis": log_axis("deg/h", 10.0**values),
             "camera": {"eye": {"x": -1.7, "y": -2.0, "z": 1.0}, "center": {"z": -0.2}},
             "aspectratio": {"x": 1.8, "y": 1.1, "z": 0.8},
