@@ -31,6 +31,7 @@ nb_merge_streams = True
 autosummary_generate = True
 autodoc_typehints = "none"
 napoleon_google_docstring = False
+napoleon_use_param = False
 napoleon_use_rtype = False
 intersphinx_mapping = {}  # the build needs no network
 
