@@ -116,7 +116,7 @@ def draw_change(surfaces: xr.Dataset, content: Mapping[str, Any]) -> go.Figure:
     names, tau = axis_names(surfaces), surfaces["tau"].values
     frame = make_subplots(
         rows=len(names), cols=2, shared_xaxes="all", shared_yaxes="all",
-        horizontal_spacing=0.1, vertical_spacing=0.05,
+        horizontal_spacing=0.13, vertical_spacing=0.05,
         column_titles=["without the effects", "with the effects"],
     )  # fmt: skip
     for column, case in enumerate(_CASES, start=1):
