@@ -21,13 +21,13 @@ def delete_stale_code(folder: Path) -> None:
     that it calls has: after an update, results would be those of neither version. What the sources
     were is noted in ``__pycache__/sources.txt``.
     """
-    sources = [(path, path.stat()) for path in sorted(folder.rglob("*.py"))]
-    state = "".join(
-        f"{path.relative_to(folder).as_posix()} {stat.st_mtime_ns} {stat.st_size}\n"
-        for path, stat in sources
-    )
     note = folder / "__pycache__" / "sources.txt"
     try:
+        sources = [(path, path.stat()) for path in sorted(folder.rglob("*.py"))]
+        state = "".join(
+            f"{path.relative_to(folder).as_posix()} {stat.st_mtime_ns} {stat.st_size}\n"
+            for path, stat in sources
+        )
         if note.exists() and note.read_text(encoding="utf-8") == state:
             return
         for compiled in folder.rglob("*.nb[ic]"):

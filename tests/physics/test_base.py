@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -223,6 +223,31 @@ def test_explains_reduced_data(kind):
     for name, values in grid.items():
         for value in np.atleast_1d(values):
             kind.example(**{name: float(value)}).explain(windows)
+
+
+@with_each_effect
+def test_window_means_depend_neither_on_bands_nor_on_the_phase_of_the_ramp(kind):
+    edges = np.arange(0.0, SIZE / RATE + 1, 20.0)
+    windows = Windows(
+        begin=edges[:-1],
+        end=edges[1:],
+        frequency=np.geomspace(0.1, 5.0, 14),
+        rate=RATE,
+        axes=("x", "y", "z"),
+        drivers={
+            name: values.reshape(-1, 200).mean(axis=1) for name, values in drivers(kind).items()
+        },
+        own={axis: np.linspace(9.0, 11.0, 15) for axis in "xyz"},
+        phase=(np.arange(16) + 0.5) / 16,
+        turns=np.full(15, 0.3),
+    )
+    effect = kind.example()
+    full = effect.explain(windows).mean
+    fewer = replace(windows, frequency=windows.frequency[:1], phase=np.empty(0))
+    fewer_means = effect.explain(fewer).mean
+    assert fewer_means.keys() == full.keys()
+    for name, values in full.items():
+        np.testing.assert_array_equal(fewer_means[name], values)
 
 
 @with_each_effect
