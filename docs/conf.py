@@ -35,6 +35,8 @@ napoleon_use_param = False
 napoleon_use_rtype = False
 intersphinx_mapping = {}  # the build needs no network
 
+smartquotes_action = "qe"  # quotes and ellipses; two hyphens begin an option
+
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_theme = "pydata_sphinx_theme"
