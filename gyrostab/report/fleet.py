@@ -96,8 +96,9 @@ def _summarise_fleet(table: pd.DataFrame, done: pd.DataFrame, failed: pd.DataFra
     text = f"{runs} run{'s' * (runs != 1)} of {tools} tool{'s' * (tools != 1)}"
     if len(done):
         hours = done["span [s]"].sum() / HOUR
-        first, last = done["start"].min(), done["end"].max()
-        text += f", {hours:.4g} h of logs from {first:%Y-%m-%d} to {last:%Y-%m-%d}"
+        first, last = (f"{time:%Y-%m-%d}" for time in (done["start"].min(), done["end"].max()))
+        days = f"on {first}" if first == last else f"from {first} to {last}"
+        text += f", {hours:.{0 if hours >= 100 else 1}f} h of logs {days}"
     return text + (f". {len(failed)} failed." if len(failed) else ". None failed.")
 
 

@@ -225,6 +225,21 @@ def test_the_overview_escapes_names_and_links_reports(done, tmp_path):
     assert 'href="reports/tool%201/run%20%3Cb%3E.html"' in text
 
 
+@pytest.mark.parametrize(
+    ("hours", "days", "said"),
+    [
+        (0.2, 1, "0.4 h of logs on 2026-05-01"),
+        (6172.5, 500, "12345 h of logs from 2026-05-01 to 2027-09-12"),
+    ],
+)
+def test_the_overview_states_hours_and_days(done, tmp_path, hours, days, said):
+    table = read_table(done / "index.parquet", content="runs").assign(report="")
+    table["span [s]"] = 3600.0 * hours  # of two runs and one that failed
+    table["start"] = pd.Timestamp("2026-05-01")
+    table["end"] = pd.Timestamp("2026-05-01") + pd.Timedelta(days - 1, "D")
+    assert said in write_overview(table, tmp_path / "index.html").read_text(encoding="utf-8")
+
+
 def test_a_run_that_failed_has_no_report(archive, tmp_path):
     log = archive / "tool 2" / "broken" / "log.nc"
     options = {"reading": {}, "windows": WINDOWS, "fitting": {}}
