@@ -11,12 +11,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gyrostab.allan.davar import davar_parts
 from gyrostab.allan.plan import make_plan
 from gyrostab.io.datasets import to_netcdf
 from gyrostab.jobs.engine import compute_part
 from gyrostab.jobs.load import check_run_options, load_log
 from gyrostab.progress import watch_compiler
+from gyrostab.time.durations import format_duration
 
 
 def estimate_run(
@@ -43,11 +46,13 @@ def estimate_run(
         total, first, tau = parts[-1].stop, parts[0], plan.taus
         yield "\n".join(
             [
-                f"record     {log.sizes['time'] / rate:.6g} s at {rate:.6g} Hz, axes "
-                f"{', '.join(plan.signal['axis'].values)}",
-                f"windows    {total} of {plan.unit.window / rate:g} s, one every "
-                f"{plan.unit.step / rate:g} s, in {len(parts)} part{'s' * (len(parts) > 1)}",
-                f"averaging  {tau.size} times from {tau[0]:.4g} to {tau[-1]:.4g} s",
+                f"record     {format_duration(log.sizes['time'] / rate, ' ')} at {rate:.6g} Hz, "
+                f"axes {', '.join(plan.signal['axis'].values)}",
+                f"windows    {total} of {format_duration(plan.unit.window / rate, ' ')}, one every "
+                f"{format_duration(plan.unit.step / rate, ' ')}, "
+                f"in {len(parts)} part{'s' * (len(parts) > 1)}",
+                f"averaging  {tau.size} times from {format_duration(tau[0], ' ')} to "
+                f"{format_duration(tau[-1], ' ')}",
             ]
         )
         base = _measure_part(log, slice(0, 1), windows, fitting)  # compiles or loads the kernels
@@ -59,12 +64,34 @@ def estimate_run(
     seconds = opened + worked / min(cores, len(parts))
     yield "\n".join(
         [
-            f"time       about {seconds:.2g} s on {cores} idle cores ({opened + worked:.2g} s of "
-            "processor time)",
+            f"time       about {_round_duration(seconds)} on {cores} idle cores "
+            f"({_round_duration(opened + worked)} of processor time)",
             f"memory     {_peak_mb():.0f} MB with one core",
-            f"output     about {(base + (size - base) * share) / 1e6:.2g} MB",
+            f"output     about {_round_number((base + (size - base) * share) / 1e6)} MB",
         ]
     )
+
+
+def _round_number(value: float) -> str:
+    """Format a number to two digits, without an exponent.
+
+    Examples
+    --------
+    >>> _round_number(123.4), _round_number(0.0123)
+    ('120', '0.012')
+    """
+    return np.format_float_positional(float(f"{value:.2g}"), trim="-")
+
+
+def _round_duration(seconds: float) -> str:
+    """Format a length of time to two digits, in its largest unit.
+
+    Examples
+    --------
+    >>> _round_duration(43.21), _round_duration(1512.0)
+    ('43 s', '25 min')
+    """
+    return format_duration(float(f"{seconds:.2g}"), " ")
 
 
 @contextmanager

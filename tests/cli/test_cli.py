@@ -24,6 +24,7 @@ from gyrostab.ingest.make_log import make_log
 from gyrostab.io.datasets import to_netcdf
 from gyrostab.io.opening import open_log, open_product, open_surface
 from gyrostab.progress import show_progress
+from gyrostab.time.durations import format_duration
 from tests.support.command_line import N_TRUE, WINDOW, call, stopped, write_log
 
 COMMANDS = (
@@ -123,8 +124,9 @@ def test_a_dry_run_describes_the_product_and_writes_nothing(log, product, tmp_pa
     assert not list(tmp_path.iterdir())
     shown = capsys.readouterr().out
     made = open_product(product)
-    assert re.search(rf"^windows +{made.sizes['time']} of {made.window_s:g} s", shown, re.M)
-    assert re.search(rf"^averaging +{made.sizes['tau']} times from {made.tau[0]:.4g}", shown, re.M)
+    window, tau = (format_duration(time, " ") for time in (made.window_s, float(made.tau[-1])))
+    assert re.search(rf"^windows +{made.sizes['time']} of {window}, one every", shown, re.M)
+    assert re.search(rf"^averaging +{made.sizes['tau']} times from \S+ m?s to {tau}$", shown, re.M)
     (size,) = re.findall(r"^output +about (\S+) MB$", shown, re.M)
     assert float(size) * 1e6 == pytest.approx(product.stat().st_size, rel=0.2)
 
