@@ -42,6 +42,18 @@ def format_share(share: float) -> str:
     return "> 99 %" if 0.99 < share < 1.0 else f"{100.0 * share:.0f} %"
 
 
+def format_rounded(value: float) -> str:
+    """Format a number to two digits; a large one is written out, without an exponent.
+
+    Examples
+    --------
+    >>> format_rounded(123.4), format_rounded(0.0123), format_rounded(1.2e-7)
+    ('120', '0.012', '1.2e-07')
+    """
+    text = f"{value:.2g}"
+    return f"{float(text):.0f}" if "e+" in text else text
+
+
 def format_value(value: float, error: float | None = None) -> str:
     """Format a value to the second digit of its error; to four digits without an error.
 

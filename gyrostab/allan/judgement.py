@@ -13,7 +13,7 @@ from gyrostab.noise import LAWS
 from gyrostab.schema import OBSERVED, check_product, is_rate_of_change, texts
 from gyrostab.time.durations import format_duration
 from gyrostab.units import HOUR
-from gyrostab.wording import join_words
+from gyrostab.wording import format_rounded, join_words
 
 #: Lengths of windows to suggest [s].
 SUGGESTED_WINDOWS_S = (60, 300, 1200, *(int(hours * HOUR) for hours in (1, 4, 24)))
@@ -85,7 +85,9 @@ def suggest_windows(span: float, white: float) -> list[str]:
     ]
     for window in lengths:
         sizes = smallest_observable(window, white).items()
-        limits = ", ".join(f"{term} from {size:.2g} {LAWS[term].label}" for term, size in sizes)
+        limits = ", ".join(
+            f"{term} from {format_rounded(size)} {LAWS[term].label}" for term, size in sizes
+        )
         count = int(span // window)
         lines.append(
             f"  --window {format_duration(window)}: {limits}; {count} windows without overlap"
@@ -172,7 +174,10 @@ def _judge_changes(product: xr.Dataset, changes: dict[tuple[str, str], dict[str,
     )
     falls = all(ratio < 1.0 for ratio in ratios.values())
     sizes = join_words(
-        [f"{1.0 / ratio if falls else ratio:.2g} on {axis}" for axis, ratio in ratios.items()]
+        [
+            f"{format_rounded(1.0 / ratio if falls else ratio)} on {axis}"
+            for axis, ratio in ratios.items()
+        ]
     )
     rises = all(ratio > 1.0 for ratio in ratios.values())
     change = "is smaller" if falls else "is larger" if rises else "changes"
@@ -235,7 +240,7 @@ def _judge_steadiness(product: xr.Dataset) -> str:
     if not spreads:
         return "N is observed in too few windows to judge how steady it is."
     changing = [
-        f"{ratio:.2g} on {axis} (highest around {str(when)[:19].replace('T', ' ')})"
+        f"{format_rounded(ratio)} on {axis} (highest around {str(when)[:19].replace('T', ' ')})"
         for axis, _, ratio, when in spreads
         if ratio > _MIN_RATIO
     ]
@@ -277,7 +282,7 @@ def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]
     limits = smallest_observable(longer[-1], white)
     is_allan = product.attrs.get("variance", "avar") == "avar"  # which the limits are for
     sizes = [
-        f"{term} from {limits[term]:.2g} {LAWS[term].label}"
+        f"{term} from {format_rounded(limits[term])} {LAWS[term].label}"
         for term in hidden
         if term in limits and np.isfinite(white) and is_allan
     ]
@@ -295,9 +300,9 @@ def _explain_coverage(product: xr.Dataset) -> str:
         return ": they hold no sample"
     most = float(coverage.max())
     return (
-        f": they hold at most {100 * most:.2g} % of their samples, and averaging times of which "
-        f"less than {100 * least:g} % is left are not used; give a min_coverage (--min-coverage) "
-        f"below {most:.2g}"
+        f": they hold at most {format_rounded(100 * most)} % of their samples, and averaging times "
+        f"of which less than {100 * least:g} % is left are not used; give a min_coverage "
+        f"(--min-coverage) below {most:.2g}"
     )
 
 

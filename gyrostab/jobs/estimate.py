@@ -11,8 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gyrostab.allan.davar import davar_parts
 from gyrostab.allan.plan import make_plan
 from gyrostab.io.datasets import to_netcdf
@@ -20,6 +18,7 @@ from gyrostab.jobs.engine import compute_part
 from gyrostab.jobs.load import check_run_options, load_log
 from gyrostab.progress import watch_compiler
 from gyrostab.time.durations import format_duration
+from gyrostab.wording import format_rounded
 
 
 def estimate_run(
@@ -67,20 +66,9 @@ def estimate_run(
             f"time       about {_round_duration(seconds)} on {cores} idle cores "
             f"({_round_duration(opened + worked)} of processor time)",
             f"memory     {_peak_mb():.0f} MB with one core",
-            f"output     about {_round_number((base + (size - base) * share) / 1e6)} MB",
+            f"output     about {format_rounded((base + (size - base) * share) / 1e6)} MB",
         ]
     )
-
-
-def _round_number(value: float) -> str:
-    """Format a number to two digits, without an exponent.
-
-    Examples
-    --------
-    >>> _round_number(123.4), _round_number(0.0123)
-    ('120', '0.012')
-    """
-    return np.format_float_positional(float(f"{value:.2g}"), trim="-")
 
 
 def _round_duration(seconds: float) -> str:

@@ -16,7 +16,7 @@ from gyrostab.diagnose.result.text import plain_name
 from gyrostab.diagnose.result.verdict import doubtful_names, failed_checks
 from gyrostab.diagnose.settings import Settings, stored_settings
 from gyrostab.diagnose.statistics.mismatch_wording import axes_text
-from gyrostab.wording import format_value, join_words
+from gyrostab.wording import format_rounded, format_value, join_words
 
 
 def summary(content: Mapping[str, Any]) -> str:
@@ -215,8 +215,8 @@ def _unequal_noise_texts(noise: Mapping[str, Any], settings: Settings) -> list[s
             continue
         names = join_words([other for other in noise if other != axis])
         texts.append(
-            f"{symbol} of {axis} is at least {entry['value'] / largest:.2g} times that of {names}: "
-            f"a wandering bias on {axis} may have been calibrated as noise."
+            f"{symbol} of {axis} is at least {format_rounded(entry['value'] / largest)} times that "
+            f"of {names}: a wandering bias on {axis} may have been calibrated as noise."
         )
     return texts
 

@@ -21,6 +21,7 @@ from gyrostab.diagnose.statistics.scores import (
     sum_over_windows,
     window_set,
 )
+from gyrostab.wording import format_rounded
 
 #: Lengths of the windows [blocks]; the record as a whole is one more.
 LENGTHS = (20, 80)
@@ -115,7 +116,7 @@ class VarianceFluctuation(Statistic):
     def describe(self, region: Mapping[str, Any], when: str) -> str:
         pace = length_text(float(region["quantity"].split()[1]))
         estimate = region.get("estimate", np.nan)
-        size = f" by {100.0 * estimate:.2g} % (rms)" if np.isfinite(estimate) else ""
+        size = f" by {format_rounded(100.0 * estimate)} % (rms)" if np.isfinite(estimate) else ""
         return (
             f"The noise level of {axes_text(region['axes'])} fluctuates {when}: at "
             f"{taus_text(region)} its power changes{size} from one stretch of {pace} to another, "

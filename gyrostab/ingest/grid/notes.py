@@ -23,6 +23,7 @@ from gyrostab.schema import log_channels
 from gyrostab.time.durations import format_measured_duration
 from gyrostab.time.grid import grid_times
 from gyrostab.time.stamps import format_stamp, to_nanoseconds
+from gyrostab.wording import format_rounded
 
 #: Scatter of stamps [samples] above which, and share of rows without a sample above which, the
 #: rate may be wrong if many samples are missing.
@@ -253,9 +254,8 @@ def _describe_missing(raw: xr.Dataset, placement: Placement, table: Ints) -> lis
         share = total / placement.size
         notes.append(
             f"{record_name(raw)}: missing: {_count_of(total, 'sample')} "
-            f"({format_measured_duration(total / rate)}, {100 * share:.2g} % of the log) "
-            f"in {_count_of(len(holes), 'place')}; "
-            "all are in the table of gaps"
+            f"({format_measured_duration(total / rate)}, {format_rounded(100 * share)} % of the "
+            f"log) in {_count_of(len(holes), 'place')}; all are in the table of gaps"
         )
     return notes
 

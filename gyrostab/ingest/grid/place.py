@@ -34,6 +34,7 @@ from gyrostab.kernels.grid.stamps import (
 from gyrostab.time.durations import format_measured_duration
 from gyrostab.time.grid import period_ns
 from gyrostab.time.stamps import format_stamp
+from gyrostab.wording import format_rounded
 
 NO_STAMPS = (
     "{where}: no row has a readable stamp; check the time column and its unit (--map), "
@@ -124,7 +125,7 @@ def check_grid(
     if gap >= 1.0:
         fix = (
             "correct the stamp or the unit of the time column, or give --max-gap "
-            f"{min(max_gap, gap) / 2:.2g}s to take it for a clock step"
+            f"{format_rounded(min(max_gap, gap) / 2)}s to take it for a clock step"
         )
     else:
         fix = (
