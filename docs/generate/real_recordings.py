@@ -99,7 +99,7 @@ def command(entry):
 
 
 def break_command(text):
-    """Break a command of an indented block before options, into lines of at most 96 columns."""
+    """Break a command of an indented block before options; 96 columns hold all but long ones."""
     line, *options = text.replace(" --", "\n--").split("\n")
     lines = [line]
     for option in options:

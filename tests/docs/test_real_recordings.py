@@ -65,6 +65,14 @@ def examine(
     return run
 
 
+def test_the_page_has_the_command_of_each_recording() -> None:
+    page = (ROOT / "docs" / "real-recordings.md").read_text(encoding="utf-8")
+    lines = page.replace(" \\\n        ", " ").splitlines()
+    commands = [line.removeprefix("    ") for line in lines if line.startswith("    gyrostab run")]
+    assert commands == [SCRIPT.command(entry) for entry in ENTRIES.values()]
+    assert page.count(" \\\n") > len(commands)
+
+
 def deviation(product: xr.Dataset, axis: str, tau: float, unit: str) -> np.ndarray:
     nearest = product["avar"].sel(axis=axis).sel(tau=tau, method="nearest")
     assert float(nearest.tau) == pytest.approx(tau, rel=0.02)

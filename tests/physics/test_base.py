@@ -187,17 +187,25 @@ def test_say_returns_one_sentence(kind):
     assert not errors or "0.12" in effect.say(errors)
 
 
-@with_each_effect
-def test_explains_reduced_data(kind):
+def reduced_windows(kind, **more):
+    """Return 15 windows of 20 s, with the channels that an effect follows."""
     edges = np.arange(0.0, SIZE / RATE + 1, 20.0)
     means = {name: values.reshape(-1, 200).mean(axis=1) for name, values in drivers(kind).items()}
-    windows = Windows(
+    return Windows(
         begin=edges[:-1],
         end=edges[1:],
         frequency=np.geomspace(0.1, 5.0, 14),
         rate=RATE,
         axes=("x", "y", "z"),
         drivers=means,
+        **more,
+    )
+
+
+@with_each_effect
+def test_explains_reduced_data(kind):
+    windows = reduced_windows(
+        kind,
         own={axis: np.full(15, 10.0) for axis in "xyz"},
         gaps=np.array([[70.0, 76.0], [150.0, 190.0]]),
         restarts=np.array([[150.0, 190.0]]),
@@ -227,16 +235,8 @@ def test_explains_reduced_data(kind):
 
 @with_each_effect
 def test_window_means_depend_neither_on_bands_nor_on_the_phase_of_the_ramp(kind):
-    edges = np.arange(0.0, SIZE / RATE + 1, 20.0)
-    windows = Windows(
-        begin=edges[:-1],
-        end=edges[1:],
-        frequency=np.geomspace(0.1, 5.0, 14),
-        rate=RATE,
-        axes=("x", "y", "z"),
-        drivers={
-            name: values.reshape(-1, 200).mean(axis=1) for name, values in drivers(kind).items()
-        },
+    windows = reduced_windows(
+        kind,
         own={axis: np.linspace(9.0, 11.0, 15) for axis in "xyz"},
         phase=(np.arange(16) + 0.5) / 16,
         turns=np.full(15, 0.3),

@@ -18,14 +18,14 @@ from gyrostab.kernels.compiled import INNER, KERNEL, REORDER
 #: What is this much less likely than the best, as a logarithm, adds nothing that counts: it is
 #: taken for so likely.
 _NEGLIGIBLE = 40.0
-#: Taylor coefficients of the exponential, the highest power first. The 128th power of the series is
-#: wrong by at most 3e-16 between -40 and 0 (near -8).
+#: Taylor coefficients of the exponential, the highest power first. The terms left out change the
+#: 128th power of the series by at most 3e-16 between -40 and 0.
 _EXPONENTIAL_SERIES = tuple(1.0 / math.factorial(n) for n in range(7, -1, -1))
 
 
 @njit(fastmath=REORDER, **INNER)
-def _exponentiate(values):  # type: ignore[no-untyped-def]
-    """Replace values from -40 to 0 by their exponentials, to an error of 2e-14.
+def _take_exponentials(values):  # type: ignore[no-untyped-def]
+    """Replace values from -40 to 0 by their exponentials, to an error of 2e-14 (rounding).
 
     The 128th power of a Taylor series takes only products and sums, which become vector code; the
     exponential of the mathematical library is several times slower without AVX-512.
@@ -100,7 +100,7 @@ def mixed_evidence(base: Floats, rotated: Floats, eigenvalues: Floats, widths: F
     for d in range(designs):
         _write_terms(base, rotated[:, d], eigenvalues[:, d], widths, terms)
         _subtract_largest(terms, out[d])
-        _exponentiate(terms.ravel())
+        _take_exponentials(terms.ravel())
         total[:] = 0.0
         for term in terms:
             for r in range(records):
