@@ -307,7 +307,7 @@ def _time_unit(column: ColumnInspection) -> tuple[str, str]:
             return unit, "its size, that of Unix time"
     serials = [unit for unit, (low, high) in _SERIAL_DAYS.items() if low <= column.first < high]
     unit = min([*_UNITS, *serials], key=lambda unit: _rate_distance(column, unit))
-    return unit, f"the rate of {1.0 / (column.pace * unit_seconds(unit)):.4g} Hz that it gives"
+    return unit, f"the rate of {1.0 / (column.pace * unit_seconds(unit)):.6g} Hz that it gives"
 
 
 def _rate_distance(column: ColumnInspection, unit: str) -> float:
