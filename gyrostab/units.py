@@ -105,7 +105,7 @@ _add_unit("temperature", 1.0, "K", "kelvin", "degK", offset=-273.15)
 _add_unit(
     "temperature", 5.0 / 9.0, "degF", "F", "fahrenheit", "deg fahrenheit", offset=-160.0 / 9.0
 )
-_add_unit("acceleration", 1.0, "g", "gn", "gee", "gs", "g0", "g_n", "9.80665 m s-2")
+_add_unit("acceleration", 1.0, "g", "gn", "gee", "gs", "g0", "g_n", "g rms", "9.80665 m s-2")
 _add_unit("acceleration", 1e-3, "mg", "milli-g", "milli g", "millig", "mgee")
 _add_unit("acceleration", 1e-6, "ug", "µg", "micro-g", "microg")
 _add_unit("acceleration", 1.0 / 9.80665, "mps2")

@@ -21,18 +21,16 @@ from operator import itemgetter
 from gyrostab.ingest.columns.headers import (
     AXIS_PATTERN,
     INCREMENT_PATTERN,
-    TEMPERATURE_PATTERN,
     is_unit,
     is_unit_of,
-    quantity_of,
 )
+from gyrostab.ingest.columns.likely_channels import find_likely_channels, find_unit_in_name
 from gyrostab.ingest.guess_unit import (
     TYPICAL_RATE_HZ,
     Guess,
     given_unit,
     guess_time,
     guess_unit,
-    name_unit,
     rises_by_row,
     unit_seconds,
 )
@@ -98,7 +96,7 @@ def guess_columns(
         guess.warnings.append(
             "no column looks like a gyro; if one is, name it: --map NAME=gyro_x --unit gyro=deg/s"
         )
-    guess.temperature = _find_temperature(inspection, guess.axes)
+    guess.channels = _guess_channels(inspection, guess)
     return guess
 
 
@@ -140,17 +138,19 @@ def _assume_rate(inspection: FileInspection, rate_hint: float | None, warnings: 
     return rate
 
 
-def _find_temperature(
-    inspection: FileInspection, axes: Mapping[str, ColumnInspection]
-) -> ColumnInspection | None:
-    """Return the only temperature beyond the axes, unless the file names one."""
-    axis_keys = {column.key for column in axes.values()}
-    temperatures = [c for c in inspection.columns if c.key not in axis_keys and _is_temperature(c)]
-    is_named = any(
-        column.role == "channel" and quantity_of(column.name) == "temperature"
-        for column in inspection.columns
-    )
-    return temperatures[0] if len(temperatures) == 1 and not is_named else None
+def _guess_channels(
+    inspection: FileInspection, guess: Guess
+) -> dict[str, tuple[ColumnInspection, str]]:
+    """Return column and unit of each channel that only one column beyond the axes may be."""
+    used_keys = {column.key for column in [*guess.group, *filter(None, [guess.time])]}
+    others = [column for column in inspection.columns if column.key not in used_keys]
+    channels: dict[str, tuple[ColumnInspection, str]] = {}
+    named = [(column.key, column.unit) for column in others]
+    for channel, likely in find_likely_channels(named).items():
+        varying = [column for column in likely if others[column.place].std > 0]
+        if len(varying) == 1:
+            channels[channel] = others[varying[0].place], varying[0].unit
+    return channels
 
 
 def _guess_axes(inspection: FileInspection, guess: Guess) -> None:
@@ -184,7 +184,9 @@ def _guess_axes(inspection: FileInspection, guess: Guess) -> None:
     guess.axes = best[1]
     names = ", ".join(column.key for column in guess.group)
     named = _STRONG.search(names.lower()) or any(
-        given_unit(column) or name_unit(column, "rate") or INCREMENT_PATTERN.search(column.key)
+        given_unit(column)
+        or find_unit_in_name(column.key, "rate")
+        or INCREMENT_PATTERN.search(column.key)
         for column in guess.group
     )
     guess.reasons.append(f"{names}: the gyro, by {'name' if named else 'name and numbers'}")
@@ -197,8 +199,8 @@ def _may_be_gyro(column: ColumnInspection) -> bool:
     others = ("acceleration", "temperature", "magnetic", "pressure")
     if is_unit_of(column.unit, others):
         return False
-    return name_unit(column, "rate") is not None or not any(
-        name_unit(column, kind) for kind in (*others, "voltage")
+    return find_unit_in_name(column.key, "rate") is not None or not any(
+        find_unit_in_name(column.key, kind) for kind in (*others, "voltage")
     )
 
 
@@ -246,8 +248,8 @@ def _gyro_score(
     if increments or any(given_unit(column) for column in group):
         score = 4.0
     else:
-        score = 2.5 * any(name_unit(column, "rate") for column in group)
-        score += bool(_STRONG.search(low)) and any(name_unit(c, "angle") for c in group)
+        score = 2.5 * any(find_unit_in_name(column.key, "rate") for column in group)
+        score += bool(_STRONG.search(low)) and any(find_unit_in_name(c.key, "angle") for c in group)
     if _STRONG.search(low):
         score += 3.0
     elif _LETTER.search(low) or re.search(r"(^|\.)[A-Z]J(\*|\w)", template):
@@ -292,14 +294,4 @@ def _mean_over_scatter(group: Sequence[ColumnInspection]) -> float:
     """Return the ratio of mean and scatter."""
     return math.hypot(*(c.mean for c in group)) / max(
         math.hypot(*(c.scatter for c in group)), 1e-300
-    )
-
-
-def _is_temperature(column: ColumnInspection) -> bool:
-    return column.std > 0 and (
-        given_unit(column, "temperature")
-        or (
-            bool(TEMPERATURE_PATTERN.search(column.key.lower()))
-            and name_unit(column, "temperature") is not None
-        )
     )

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gyrostab.ingest.columns.headers import TIME_PATTERN, is_time_unit, is_unit, is_unit_of
+from gyrostab.ingest.columns.likely_channels import find_unit_in_name
 from gyrostab.ingest.columns.stamps import DATENUM, parse_time_unit
 from gyrostab.ingest.inspect import ColumnInspection, FileInspection
 from gyrostab.time.grid import MAX_RATE_HZ
@@ -58,7 +59,8 @@ class Guess:
     `axes` are the columns of the gyro by axis (empty if no column looks like one); `unit` is the
     unit to give for them, None if they carry one; `time` and `time_unit` likewise (of dates, the
     order of day and month); `kind` is the kind to give for angles; `rate` [Hz] is set for a file
-    without time. `sampling_rate_hz` is the rate that the guess is based on.
+    without time; `channels` are the columns of other sensors by channel, with their units.
+    `sampling_rate_hz` is the rate that the guess is based on.
     """
 
     axes: dict[str, ColumnInspection] = field(default_factory=dict)
@@ -66,7 +68,7 @@ class Guess:
     time: ColumnInspection | None = None
     time_unit: str | None = None
     rate: float | None = None
-    temperature: ColumnInspection | None = None
+    channels: dict[str, tuple[ColumnInspection, str]] = field(default_factory=dict)
     reasons: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     sampling_rate_hz: float = math.nan
@@ -81,27 +83,6 @@ class Guess:
 def given_unit(column: ColumnInspection, quantity: str = "rate") -> bool:
     """Return whether the header gives a unit of rates, or of another quantity."""
     return is_unit_of(column.unit, (quantity,))
-
-
-def name_unit(column: ColumnInspection, quantity: str) -> str | None:
-    """Return the unit at the end of a column name, such as ``deg/h`` in ``gx_deg_per_h``."""
-    tokens = [
-        token for token in re.split(r"[\s_./\-]+", re.sub(r"\[\d+\]$", "", column.key)) if token
-    ]
-    for count in range(min(4, len(tokens) - 1), 0, -1):
-        last = tokens[-count:]
-        for text in (" ".join(last), "/".join(last)):
-            if len(text) > 1 or text in ("C", "K", "F", "g", "V", "T", "G"):
-                text = {"degs": "deg/s", "rads": "rad/s"}.get(text, text)
-                if is_unit_of(text, (quantity,)) and text not in ("1", "-"):
-                    return parse_unit(text, quantity).text.replace(" per ", "/")
-    return None
-
-
-def temperature_unit(column: ColumnInspection) -> str:
-    """Return the unit of a temperature column, from its header or its name."""
-    has_unit = given_unit(column, "temperature")
-    return str(column.unit if has_unit else name_unit(column, "temperature") or "degC")
 
 
 def guess_unit(inspection: FileInspection, guess: Guess, *, angles: bool) -> None:
@@ -144,8 +125,8 @@ def _guess_by_name(guess: Guess, *, angles: bool) -> bool:
     """Guess the unit by the headers of the columns; return whether one names it."""
     for column in guess.group:
         in_header = given_unit(column)
-        named = column.unit if in_header else name_unit(column, "rate")
-        if named is None and not angles and (angle := name_unit(column, "angle")):
+        named = column.unit if in_header else find_unit_in_name(column.key, "rate")
+        if named is None and not angles and (angle := find_unit_in_name(column.key, "angle")):
             named = f"{angle}/s"
         if named is not None and is_unit_of(named, ("rate",)):
             by = "that of another axis" if in_header else "name"

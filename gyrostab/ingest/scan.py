@@ -21,7 +21,7 @@ from gyrostab.ingest.grid.gaps import gap_table
 from gyrostab.ingest.grid.regularise import regularise
 from gyrostab.ingest.grid.scan_pass import find_spans
 from gyrostab.ingest.guess import guess_columns
-from gyrostab.ingest.guess_unit import Guess, temperature_unit
+from gyrostab.ingest.guess_unit import Guess
 from gyrostab.ingest.inspect import FileInspection, inspect_file
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.ingest.reading import read_log
@@ -192,8 +192,8 @@ def _try_guess(
     mapped = {column.key: f"gyro_{axis}" for axis, column in axes if column.role != "gyro"}
     if guess.time is not None and guess.time.role != "time":
         mapped[guess.time.key] = "time"
-    if guess.temperature is not None:
-        mapped[guess.temperature.key] = f"temperature [{temperature_unit(guess.temperature)}]"
+    for channel, (column, unit) in guess.channels.items():
+        mapped[column.key] = f"{channel} [{unit}]"
     is_angle = any(column.name.lower().startswith("angle_") for _, column in axes)
     units = {"angle" if is_angle else "gyro": guess.unit, "time": guess.time_unit}
     guessed = {

@@ -144,8 +144,7 @@ def _inspection_rows(inspected_file: InspectedFile) -> list[tuple[str, ...]]:
     targets = {column.key: f"gyro_{axis}" for axis, column in guess.axes.items()}
     if guess.time is not None:
         targets[guess.time.key] = "time"
-    if guess.temperature is not None:
-        targets.setdefault(guess.temperature.key, "temperature")
+    targets |= {column.key: channel for channel, (column, _) in guess.channels.items()}
     rows: list[tuple[str, ...]] = []
     if inspected_file.inspection.time is not None:
         time = inspected_file.inspection.time

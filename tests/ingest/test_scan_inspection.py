@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import shlex
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from gyrostab.arrays import Floats
 from gyrostab.ingest.guess import guess_columns
 from gyrostab.ingest.guess_unit import EARTH_RATE_DPH, rate_plausibility
 from gyrostab.ingest.inspect import inspect_file
+from gyrostab.ingest.reading import read_log
 from gyrostab.io.opening import open_product
 from tests.support.command_line import call
 
@@ -399,6 +401,41 @@ def test_the_only_temperature_is_mapped(
     assert call("scan", path) == 0
     words = next_command(capsys.readouterr().out)
     assert [word for word in words if "=temperature" in word] == ([mapped] if mapped else [])
+
+
+@pytest.mark.parametrize(
+    ("headers", "mapped"),
+    [
+        (
+            ("Tool Temp (°F)", "Vib (g RMS)", "RPM", "Annulus [psi]", "Battery (V)"),
+            {
+                "Tool Temp=temperature [°F]",
+                "Vib=vibration [g RMS]",
+                "RPM=rotation_rate [RPM]",
+                "Annulus=pressure [psi]",
+                "Battery=supply_voltage [V]",
+            },
+        ),
+        (("AccX [g]", "AccY [g]", "AccZ [g]"), {f"Acc{a}=accel_{a.lower()} [g]" for a in "XYZ"}),
+        (("acc x (G)", "acc y (G)", "acc z (G)"), {f"acc {a}=accel_{a} [G]" for a in "xyz"}),
+        (("Bx_nT", "By_nT", "Bz_nT"), {f"B{a}_nT=mag_{a} [nT]" for a in "xyz"}),
+        # several may be meant, or none
+        (("Vib axial [g]", "Vib lateral [g]", "Bore [psi]", "Annulus [psi]"), set()),
+        (("rotation_rate [deg/s]", "RPM"), set()),
+        (("Flow", "Weight [t]", "State of health [V]", "Ax [g]", "Ay [g]"), set()),
+    ],
+)
+def test_channels_that_only_one_column_may_be_are_mapped(
+    tmp_path: Path, capsys, headers: Sequence[str], mapped: set[str]
+) -> None:
+    columns = {header: 20 + place + TIME for place, header in enumerate(headers)}
+    path = write(tmp_path / "log.csv", {"time [s]": TIME, "wx [deg/s]": GX, **columns})
+    assert call("scan", path) == 0
+    words = next_command(capsys.readouterr().out)
+    maps = {after for word, after in pairwise(words) if word == "--map"}
+    assert maps == {"wx=gyro_x", *mapped}
+    raw = read_log(path, map=dict(option.split("=") for option in maps))
+    assert {target.split("=")[1].split(" ")[0] for target in mapped} <= {*raw.data_vars}
 
 
 def test_unit_of_the_time_is_used_in_the_inspection(tmp_path: Path, capsys) -> None:

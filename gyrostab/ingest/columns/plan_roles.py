@@ -27,6 +27,7 @@ from gyrostab.ingest.columns.headers import (
     split_header,
     stored_name,
 )
+from gyrostab.ingest.columns.likely_channels import find_likely_channels
 from gyrostab.ingest.columns.plan import (
     MAX_HEADERS,
     Column,
@@ -196,7 +197,7 @@ def _find_kind(plan: Plan, header: str, key: str, name: str) -> str:
 
 def _plan_channels(plan: Plan, rest: list[FileColumn]) -> None:
     """Plan the channels: those with a unit are kept, others left out with a note or refused."""
-    _note_temperatures(plan, rest)
+    suggested = _note_likely_channels(plan, rest)
     limits, others = plan.options.limits, len(plan.columns)  # time and gyro
     unitless: list[tuple[str, str | None]] = []  # name and quantity of channels without a unit
     left_out: dict[str, list[str]] = {"unit": [], "limit": []}
@@ -224,7 +225,8 @@ def _plan_channels(plan: Plan, rest: list[FileColumn]) -> None:
             )
         is_full = len(plan.columns) - others >= limit_value("channels", limits)
         if text is None:
-            unitless.append((name, likely))
+            if column.source not in suggested:
+                unitless.append((name, likely))
             left_out["unit"].append(column.header)
             plan.leave_out(column)
         elif is_full and not (is_known or asked):
@@ -232,13 +234,11 @@ def _plan_channels(plan: Plan, rest: list[FileColumn]) -> None:
             plan.leave_out(column)
         else:
             _plan_channel(plan, column, name, quantity, text, is_known=is_known, asked=asked)
+    advice = ""
     if unitless:
         name, likely = min(unitless, key=lambda entry: entry[1] is None)  # a known quantity first
-        option = f"--unit {shlex.quote(f'{name}={example_unit(likely)}')}"
-        if likely is None and is_unit_of(name, ("rate",)):
-            option = f'--map "{name}=rotation_rate [{name}]"'
-        advice = f"keep one with a unit: {option}"
-        plan.notes += describe_left_out("they carry no unit", left_out["unit"], advice)
+        advice = f"keep one with a unit: --unit {shlex.quote(f'{name}={example_unit(likely)}')}"
+    plan.notes += describe_left_out("they carry no unit", left_out["unit"], advice)
     needed = len(plan.columns) - others + len(left_out["limit"])
     advice = "map those that are needed (--map NAME=NAME); "
     advice += describe_limit("channels", needed, limits)
@@ -246,24 +246,32 @@ def _plan_channels(plan: Plan, rest: list[FileColumn]) -> None:
     plan.notes += describe_left_out(reason, left_out["limit"], advice)
 
 
-def _note_temperatures(plan: Plan, rest: list[FileColumn]) -> None:
-    """Note which columns could be the temperature of the gyro, unless one is named so."""
+def _note_likely_channels(plan: Plan, rest: list[FileColumn]) -> set[int]:
+    """Note which columns may be channels that effects follow; return the columns to map."""
     options = plan.options
-    is_named = any(quantity_of(column.low) == "temperature" for column in rest)
-    if is_named or options.channels_only or options.channel:  # a file of channels may hold it
-        return
-    temperatures = []
-    for column in rest:
+    if options.channels_only or options.channel:  # a file of channels may hold them
+        return set()
+    named: list[tuple[str, str | None]] = []
+    for column in rest[: limit_value("channels", options.limits)]:
         key = plan.unit_key((column.low, column.key, column.header))
-        unit = column.written or (options.unit[key] if key else "")
-        if is_unit_of(unit, ("temperature",)):
-            temperatures.append(column)
-    if temperatures and not any(column.mapped for column in temperatures):
-        headers = list_some([column.header for column in temperatures], MAX_HEADERS)
+        named.append((column.key, column.written or (options.unit[key] if key else None)))
+    listed: list[str] = []
+    maps: list[str] = []
+    places: set[int] = set()
+    for channel, likely in find_likely_channels(named).items():
+        columns = [rest[column.place] for column in likely]
+        if any(column.mapped for column in columns):
+            continue
+        headers = list_some([column.header for column in columns], MAX_HEADERS)
+        unit = "" if likely[0].in_header else f" [{likely[0].unit}]"
+        listed.append(f"{channel} ({headers})")
+        maps.append(f'--map "{columns[0].key}={channel}{unit}"')
+        places.add(columns[0].source)
+    if listed:
         plan.notes.append(
-            f"in units of temperature: {headers}; name the temperature of the gyro: --map "
-            f'"{temperatures[0].key}=temperature"'
+            f"may be channels that effects follow: {', '.join(listed)}; name them: {' '.join(maps)}"
         )
+    return places
 
 
 def _plan_channel(
