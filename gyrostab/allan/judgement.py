@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from itertools import zip_longest
 
@@ -21,8 +22,9 @@ SUGGESTED_WINDOWS_S = (60, 300, 1200, *(int(hours * HOUR) for hours in (1, 4, 24
 #: falls with the window to the powers 1/2, 1 and 3/2. Measured with 42 simulated windows for each
 #: of twelve sizes, for windows of 10 min at 10 Hz and of 2 h at 2 Hz, which agree within 10 %.
 _HALF_OBSERVE = {"B": (8.3, 0.5), "K": (49.0, 1.0), "R": (26.0, 1.5)}
-#: Least change of a median from windows where a channel is low to those where it is high.
-_MIN_RATIO = 1.5
+#: Standard errors of a window beyond which a coefficient has changed: two-sided P = 0.0027 for a
+#: normal error.
+_CLEAR_SIGMA = 3.0
 #: Windows needed in either state of a channel.
 _MIN_WINDOWS = 3
 #: Share of windows from which a term counts as observed in a state, and up to which as absent.
@@ -175,7 +177,7 @@ def _judge_changes(product: xr.Dataset, changes: dict[tuple[str, str], dict[str,
     falls = all(ratio < 1.0 for ratio in ratios.values())
     sizes = join_words(
         [
-            f"{format_rounded(1.0 / ratio if falls else ratio)} on {axis}"
+            f"{_format_factor(1.0 / ratio if falls else ratio)} on {axis}"
             for axis, ratio in ratios.items()
         ]
     )
@@ -183,6 +185,19 @@ def _judge_changes(product: xr.Dataset, changes: dict[tuple[str, str], dict[str,
     change = "is smaller" if falls else "is larger" if rises else "changes"
     name = _name_channel(product, channel)
     return f"{term} {change} by a factor of {sizes} while {name} is high."
+
+
+def _format_factor(ratio: float) -> str:
+    """Format a factor, one close to 1 with as many digits as show the difference.
+
+    Examples
+    --------
+    >>> _format_factor(5.13), _format_factor(1.31), _format_factor(0.957)
+    ('5.1', '1.3', '0.96')
+    """
+    if not 0.5 < ratio < 2.0 or ratio == 1.0:
+        return format_rounded(ratio)
+    return f"{ratio:.{math.ceil(-math.log10(abs(ratio - 1.0)))}f}"
 
 
 def _find_states(product: xr.Dataset) -> list[tuple[str, Bools, Bools]]:
@@ -217,8 +232,14 @@ def _compare_states(part: xr.Dataset, term: str, low: Bools, high: Bools) -> tup
     ratio = float(np.median(above) / np.median(below))
     rises = np.quantile(above, 0.05) > np.quantile(below, 0.95)
     falls = np.quantile(above, 0.95) < np.quantile(below, 0.05)
-    differs = (rises and ratio >= _MIN_RATIO) or (falls and ratio <= 1.0 / _MIN_RATIO)
+    error = math.hypot(*(_relative_error(part, term, state & observed) for state in (low, high)))
+    differs = (rises or falls) and abs(math.log(ratio)) > _CLEAR_SIGMA * error
     return (ratio if differs else 1.0), ""
+
+
+def _relative_error(part: xr.Dataset, term: str, windows: Bools) -> float:
+    """Return the relative standard error of a coefficient in one of the windows, their median."""
+    return float(np.median(part[f"{term}_stderr"].values[windows] / part[term].values[windows]))
 
 
 def _name_channel(product: xr.Dataset, channel: str) -> str:
@@ -236,18 +257,21 @@ def _judge_steadiness(product: xr.Dataset) -> str:
         if observed.sum() >= _MIN_WINDOWS:
             low, middle, high = np.quantile(part["N"].values[observed], [0.05, 0.5, 0.95])
             when = part["time"].values[observed][np.argmax(part["N"].values[observed])]
-            spreads.append((axis, (high - low) / (2.0 * middle), high / max(low, 1e-300), when))
+            is_clear = math.log(high / low) > 2.0 * _CLEAR_SIGMA * _relative_error(
+                part, "N", observed
+            )
+            spreads.append((axis, (high - low) / (2.0 * middle), high / low, is_clear, when))
     if not spreads:
         return "N is observed in too few windows to judge how steady it is."
     changing = [
-        f"{format_rounded(ratio)} on {axis} (highest around {str(when)[:19].replace('T', ' ')})"
-        for axis, _, ratio, when in spreads
-        if ratio > _MIN_RATIO
+        f"{_format_factor(ratio)} on {axis} (highest around {str(when)[:19].replace('T', ' ')})"
+        for axis, _, ratio, is_clear, when in spreads
+        if is_clear
     ]
     if changing:
         return f"N varies by a factor of {', '.join(changing)}, from its 5 % to its 95 % quantile."
     return (
-        "N is steady: it varies by "
+        "N is steady within its errors: it varies by "
         + ", ".join(f"{100 * share:.0f} % on {axis}" for axis, share, *_ in spreads)
         + " (half of the range from 5 % to 95 %)."
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -40,6 +41,7 @@ def _make_product(states: dict[str, int], vibration: list[float] | None = None):
     product["observable"] = product["observable"].copy()
     for term in LAWS:
         product[term] = (product["window_mean"] * 0.0).fillna(0.0) + 1.0
+        product[f"{term}_stderr"] = 0.05 * product[term]
         product["observable"].loc[{"term": term}] = states.get(term, OBSERVED)
     if vibration is not None:
         product["vibration"] = ("time", np.resize(vibration, product.sizes["time"]))
@@ -48,7 +50,9 @@ def _make_product(states: dict[str, int], vibration: list[float] | None = None):
 
 def test_a_steady_product_is_called_steady():
     steady, terms = judge_product(_make_product({}))
-    assert steady.startswith("N is steady: it varies by 0 % on x, 0 % on y, 0 % on z")
+    assert steady.startswith(
+        "N is steady within its errors: it varies by 0 % on x, 0 % on y, 0 % on z"
+    )
     assert terms.startswith("All five terms are observed")
 
 
@@ -74,6 +78,43 @@ def test_a_change_names_its_channel_axis_and_size():
     assert judge_product(product)[0] == (
         "N is larger by a factor of 5 on x while vibration is high."
     )
+
+
+@pytest.mark.parametrize(
+    ("high", "sentence"),
+    [
+        (1.3, "N is larger by a factor of 1.3 on x while vibration is high."),
+        (1.24, "N is larger by a factor of 1.2 on x while vibration is high."),
+        # 3 times the error of the difference of two windows, 5 % each, is 0.21 in the logarithm
+        (1.23, "N is steady within its errors: it varies by 10 % on x, 0 % on y, 0 % on z"),
+    ],
+)
+def test_a_change_is_one_beyond_the_errors_of_its_windows(high, sentence):
+    product = _make_product({}, vibration=[0.0, 8.0])
+    product["N"].loc[{"axis": "x"}] = np.resize([1.0, high], product.sizes["time"])
+    product["N_stderr"] = 0.05 * product["N"]
+    assert judge_product(product)[0].startswith(sentence)
+
+
+@pytest.mark.parametrize("high", [1.3, 1.4])
+def test_n_varies_beyond_three_errors_on_either_side(high):
+    product = _make_product({})
+    product["N"].loc[{"axis": "x"}] = np.resize([1.0, high], product.sizes["time"])
+    varies = "N varies by a factor of 1.4 on x (highest around 2026-"
+    assert judge_product(product)[0].startswith(varies) == (high > math.exp(6 * 0.05))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_white_noise_does_not_change_with_its_channels(seed):
+    noise = np.random.default_rng(seed).standard_normal((3, 72_000))
+    log = make_log(noise, rate=10.0, unit="deg/h")
+    places = np.arange(72_000)
+    level, smooth = (places // 9000) % 2.0, np.sin(places / 30_000)
+    channels = {"vibration": level, "temperature": 150.0 + 30.0 * smooth}
+    units = {"vibration": "9.80665 m s-2", "temperature": "degree_Celsius"}
+    log = log.assign({name: ("time", channels[name], {"units": units[name]}) for name in units})
+    product = fit_noise(davar(log, window="10min"))
+    assert judge_product(product)[0].startswith("N is steady within its errors")
 
 
 def test_a_term_that_one_state_hides_is_named():
