@@ -65,7 +65,6 @@ _LABELS = {
     "K hour-1": "°C/h",
     "urad": "µrad",
     "deg/sqrt(h)": "deg/√h",
-    "deg/h^1.5": "deg/h/√h",
     "deg/h^2": "deg/h²",
 }
 

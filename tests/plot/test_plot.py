@@ -197,7 +197,7 @@ def test_coefficients_have_five_panels_in_customary_units(product):
         "Q [µrad]",
         "N [deg/√h]",
         "B [deg/h]",
-        "K [deg/h/√h]",
+        "K [deg/h^1.5]",
         "R [deg/h²]",
     ]
     assert [ax.get_title(loc="left") for ax in figure.axes] == [

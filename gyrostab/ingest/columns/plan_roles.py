@@ -252,7 +252,8 @@ def _note_likely_channels(plan: Plan, rest: list[FileColumn]) -> set[int]:
     if options.channels_only or options.channel:  # a file of channels may hold them
         return set()
     named: list[tuple[str, str | None]] = []
-    for column in rest[: limit_value("channels", options.limits)]:
+    limit = min(limit_value("channels", options.limits), len(rest))
+    for column in rest[: int(limit)]:
         key = plan.unit_key((column.low, column.key, column.header))
         named.append((column.key, column.written or (options.unit[key] if key else None)))
     listed: list[str] = []
