@@ -30,7 +30,7 @@ def _write_log(path: Path) -> None:
         clock = str(stamp).split("T")[1][:10]
         numbers = (*values[row], 150 + row / 100, 0.1 + row % 7 / 100, row / 20)
         cells = (f"{number:.3f}".replace(".", ",") for number in numbers)
-        lines.append(";".join(["03/14/2026", clock, *cells, "OK"]))
+        lines.append(";".join(["14.03.2026", clock, *cells, "OK"]))
     path.write_text("\n".join(lines) + "\n", encoding="cp1252")
 
 
