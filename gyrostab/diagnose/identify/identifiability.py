@@ -135,11 +135,12 @@ def _is_possible(component: Component, state: State) -> bool:
         and statistic.is_linear_in_means
         and _rotation_share(component, state) > settings.max_misalignment_share
     )
-    is_added = component.variant.squared and statistic.is_power
+    # noise that is added, or the share of it that a filter stops
+    is_positive = statistic.is_power and (component.variant.squared or component.is_filter)
     return (
         not is_too_large
         and _is_in_range(component, state)
-        and not (is_added and (component_mixture(component, state).mean <= 0.0).any())
+        and not (is_positive and (component_mixture(component, state).mean <= 0.0).any())
     )
 
 
