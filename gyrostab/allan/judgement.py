@@ -221,8 +221,7 @@ def _find_states(product: xr.Dataset) -> list[tuple[str, Bools, Bools]]:
 
 def _compare_states(part: xr.Dataset, term: str, low: Bools, high: Bools) -> tuple[float, str]:
     """Compare a term between two states: ratio of the medians, and the only state that shows it."""
-    observed = part["observable"].sel(term=term).values == OBSERVED
-    values = part[term].values
+    values, observed = part[term].values, _find_observed(part, term)
     in_low, in_high = float(observed[low].mean()), float(observed[high].mean())
     if max(in_low, in_high) >= _MOST and min(in_low, in_high) <= _FEW:
         return 1.0, "high" if in_high > in_low else "low"
@@ -235,6 +234,12 @@ def _compare_states(part: xr.Dataset, term: str, low: Bools, high: Bools) -> tup
     error = math.hypot(*(_relative_error(part, term, state & observed) for state in (low, high)))
     differs = (rises or falls) and abs(math.log(ratio)) > _CLEAR_SIGMA * error
     return (ratio if differs else 1.0), ""
+
+
+def _find_observed(part: xr.Dataset, term: str) -> Bools:
+    """Find the windows of an axis that observe a term, without sizes of zero, which have no ratio."""
+    is_observed = part["observable"].sel(term=term).values == OBSERVED
+    return np.asarray(is_observed & (part[term].values > 0.0))
 
 
 def _relative_error(part: xr.Dataset, term: str, windows: Bools) -> float:
@@ -253,7 +258,7 @@ def _judge_steadiness(product: xr.Dataset) -> str:
     spreads = []
     for axis in map(str, product["axis"].values):
         part = product.sel(axis=axis)
-        observed = part["observable"].sel(term="N").values == OBSERVED
+        observed = _find_observed(part, "N")
         if observed.sum() >= _MIN_WINDOWS:
             low, middle, high = np.quantile(part["N"].values[observed], [0.05, 0.5, 0.95])
             when = part["time"].values[observed][np.argmax(part["N"].values[observed])]

@@ -117,6 +117,13 @@ def test_white_noise_does_not_change_with_its_channels(seed):
     assert judge_product(product)[0].startswith("N is steady within its errors")
 
 
+def test_a_coefficient_of_zero_is_not_judged():
+    product = _make_product({}, vibration=[0.0, 8.0])
+    product["N"].loc[{"axis": "x"}] = 0.0
+    text = judge_product(product)[0]
+    assert text.startswith("N is steady within its errors: it varies by 0 % on y, 0 % on z")
+
+
 def test_a_term_that_one_state_hides_is_named():
     product = _make_product({"B": UPPER_LIMIT_ONLY}, vibration=[0.0, 8.0])
     product["observable"].loc[{"term": "B", "time": product["time"][::2]}] = OBSERVED
