@@ -237,7 +237,7 @@ def _compare_states(part: xr.Dataset, term: str, low: Bools, high: Bools) -> tup
 
 
 def _find_observed(part: xr.Dataset, term: str) -> Bools:
-    """Find the windows of an axis that observe a term, without sizes of zero, which have no ratio."""
+    """Find the windows of an axis that observe a term, with a size above zero."""
     is_observed = part["observable"].sel(term=term).values == OBSERVED
     return np.asarray(is_observed & (part[term].values > 0.0))
 
