@@ -243,10 +243,12 @@ def free_name(stem: str, used_names: Collection[str], number: int = 2) -> str:
 
 def quantity_of(low: str) -> str | None:
     """Return the quantity that a channel of this name measures, None if unknown."""
-    return next(
-        (quantity for name, quantity in QUANTITIES.items() if f"{low}_".startswith(f"{name}_")),
-        None,
-    )
+    return next((QUANTITIES[stem] for stem in QUANTITIES if is_named_after(low, stem)), None)
+
+
+def is_named_after(low: str, stem: str) -> bool:
+    """Return whether a name in lower case is a stem, or a stem before an underscore."""
+    return f"{low}_".startswith(f"{stem}_")
 
 
 def example_unit(quantity: str | None) -> str:

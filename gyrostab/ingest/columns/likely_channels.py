@@ -8,13 +8,18 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from gyrostab.errors import UnitError
-from gyrostab.ingest.columns.headers import QUANTITIES, is_unit_of
+from gyrostab.ingest.columns.headers import (
+    QUANTITIES,
+    TEMPERATURE_PATTERN,
+    is_named_after,
+    is_unit_of,
+)
 from gyrostab.units import parse_unit
 
 #: Channel -> words in the name of its column; a unit of temperature or pressure in the header needs
 #: no word.
 _WORDS = {
-    "temperature": r"temp|(^|[^a-z])tmp",
+    "temperature": TEMPERATURE_PATTERN.pattern,
     "pressure": r"press|baro",
     "vibration": r"vib",
     "rotation_rate": r"rpm|rotat|rotary|turntable",
@@ -61,16 +66,13 @@ def find_likely_channels(
         trios = _find_trios(columns, QUANTITIES[vector], word)
         if len(trios) == 1:
             likely |= {f"{vector}_{axis}": [column] for axis, column in trios[0].items()}
-    named = {stem for stem in QUANTITIES for name, _ in columns if _is_named(name, stem)}
+    names = [name.lower() for name, _ in columns]
+    named = {stem for stem in QUANTITIES for name in names if is_named_after(name, stem)}
     return {
         channel: likely_columns
         for channel, likely_columns in likely.items()
-        if not any(_is_named(channel, stem) for stem in named)
+        if not any(is_named_after(channel, stem) for stem in named)
     }
-
-
-def _is_named(name: str, stem: str) -> bool:
-    return f"{name.lower()}_".startswith(f"{stem}_")
 
 
 def _find_trios(
