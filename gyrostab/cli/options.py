@@ -58,6 +58,9 @@ class Reading:
     unit
         Unit of a column that states none: gyro=deg/s for all gyro axes, gyro_x=deg/s,
         temperature=degC; for counts the size of one count, "gyro=0.1 arcsec/s". Repeat for more.
+    missing_value
+        Number that means a missing value in columns of the gyro and of channels, as it is written
+        there: -999.25. Repeat for more.
     kind
         For gyro columns in a unit of angle: angle if they are cumulative, rate if each row holds
         the increment since the row before. Columns in a unit of rate need no --kind.
@@ -85,6 +88,7 @@ class Reading:
     epoch: Annotated[str | None, Parameter(metavar="TIME")] = None
     map: Annotated[list[str] | None, Parameter(metavar="HEADER=NAME", negative=())] = None
     unit: Annotated[list[str] | None, Parameter(metavar="NAME=UNIT", negative=())] = None
+    missing_value: Annotated[list[float] | None, Parameter(metavar="NUMBER", negative=())] = None
     kind: Literal["rate", "angle"] | None = None
     channel: Annotated[list[Path] | None, Parameter(metavar="FILE", negative=())] = None
     max_gap: Annotated[str, Parameter(metavar="DURATION")] = "10D"
@@ -108,6 +112,7 @@ class Reading:
             **asdict(self),
             "map": _parse_pairs(self.map, "--map"),
             "unit": _parse_pairs(self.unit, "--unit"),
+            "missing_value": tuple(self.missing_value or ()),
             "channel": tuple(self.channel or ()),
             "limits": check_limits(_parse_pairs(self.limit, "--limit")),
         }

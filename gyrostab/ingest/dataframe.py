@@ -25,15 +25,16 @@ _OPTION = re.compile(
     r'(?: ("[^"]*=[^"]*"|[^\s,;:()]+=[^\s,;:()]+)'
     r"|(?<=kind) (angle|rate)\b|(?<=rate) (HZ|[\d.e+-]+))?"
 )
-#: Advice that only concerns files, and its replacement.
+#: Patterns of advice that only concerns files, and their replacements.
 _FILE_ADVICE = (
     ("; gyrostab scan DataFrame inspects each column", ""),
+    (r"read it as missing with --missing-value \S+", "replace it by nan"),
     (
         "the separator, the columns that --map names and the unit of time",
         "the columns and the index",
     ),
     (
-        "check the time column and its unit, or leave it out (--map) and give --rate HZ",
+        r"check the time column and its unit, or leave it out \(--map\) and give --rate HZ",
         "correct the times, or use gyrostab.make_log(values, rate=..., unit=...)",
     ),
     (
@@ -216,7 +217,7 @@ def _name_keywords(message: str) -> str:
         return f"{keyword}={value if option == 'rate' else repr(value)}"
 
     for text, replacement in _FILE_ADVICE:
-        message = message.replace(text, replacement)
+        message = re.sub(text, replacement, message)
     return _OPTION.sub(name_keyword, message.replace('" --unit ', '", --unit '))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ class ReadOptions:
 
     Parameters
     ----------
-    rate, start, epoch, map, unit, kind, channel, strict, limits
+    rate, start, epoch, map, unit, missing_value, kind, channel, strict, limits
         As for `gyrostab.read_log`.
     channels_only : bool
         Whether the file is read only for its channels, without gyro axes.
@@ -38,6 +39,7 @@ class ReadOptions:
     epoch: str | None = None
     map: Mapping[str, str] = field(default_factory=dict)
     unit: Mapping[str, str] = field(default_factory=dict)
+    missing_value: Sequence[float] = ()
     kind: str | None = None
     channel: str | Path | Sequence[str | Path] = ()
     channels_only: bool = False
@@ -67,6 +69,7 @@ class ReadOptions:
                 if not isinstance(value, str):
                     raise OptionError(f"--{name} {key}: {value!r} is not a text; give one")
             object.__setattr__(self, name, given)
+        object.__setattr__(self, "missing_value", _check_codes(self.missing_value))
         object.__setattr__(self, "limits", check_limits(self.limits))
         object.__setattr__(self, "channel", self.channel or ())
 
@@ -74,6 +77,21 @@ class ReadOptions:
     def epoch_ns(self) -> int:
         """Epoch of numeric time [ns since 1970]."""
         return 0 if self.epoch is None else stamp_ns(self.epoch, "--epoch")
+
+
+def _check_codes(given: Any) -> tuple[float, ...]:
+    """Return the numbers that mean a missing value."""
+    codes = (given,) if np.ndim(given) == 0 else tuple(given)
+    try:
+        numbers = tuple(map(float, codes))
+    except (TypeError, ValueError):
+        numbers = (np.nan,)
+    if not np.isfinite(numbers).all():
+        raise OptionError(
+            f"--missing-value {', '.join(map(str, codes))}: give a number such as -999.25; what is "
+            "not a number is missing anyway"
+        )
+    return numbers
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,7 @@ def read_log(
     epoch: str | None = None,
     map: Mapping[str, str] | None = None,
     unit: Mapping[str, str] | None = None,
+    missing_value: float | Sequence[float] = (),
     kind: str | None = None,
     channel: str | Path | Sequence[str | Path] = (),
     strict: bool = False,
@@ -81,6 +82,9 @@ def read_log(
     unit : mapping of str to str, optional
         Name -> unit: ``{"gyro": "deg/s"}`` (all gyro axes), ``{"gyro_x": ...}``, ``{"time":
         "us"}``; factors allowed (``"0.1 arcsec/s"``).
+    missing_value : float or sequence of float
+        Numbers that mean a missing value in columns of the gyro and of channels, as they are
+        written there: ``-999.25``.
     kind : {"rate", "angle"}, optional
         How angle columns are meant: ``"angle"`` cumulative, ``"rate"`` increments.
     channel : path or sequence of path, optional
@@ -133,6 +137,7 @@ def read_log(
         epoch=epoch,
         map=map or {},
         unit=unit or {},
+        missing_value=(missing_value,) if isinstance(missing_value, int | float) else missing_value,
         kind=kind,
         channel=channel,
         strict=strict,

@@ -116,7 +116,7 @@ def load_log(
         `gyrostab.ingest.uniform.cut_log`.
     **reading
         Options of `gyrostab.ingest.read_log`: ``rate``, ``start``, ``epoch``, ``map``, ``unit``,
-        ``kind``, ``channel``, ``strict``, ``limits``, ``on_file``, ``read``.
+        ``missing_value``, ``kind``, ``channel``, ``strict``, ``limits``, ``on_file``, ``read``.
 
     Returns
     -------

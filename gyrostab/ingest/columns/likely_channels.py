@@ -16,12 +16,12 @@ from gyrostab.ingest.columns.headers import (
 )
 from gyrostab.units import parse_unit
 
-#: Channel -> words in the name of its column; a unit of temperature or pressure in the header needs
-#: no word.
+#: Channel -> words in the name or unit of its column; a unit of temperature or pressure in the
+#: header needs no word.
 _WORDS = {
     "temperature": TEMPERATURE_PATTERN.pattern,
     "pressure": r"press|baro",
-    "vibration": r"vib",
+    "vibration": r"vib|(^|[^a-z])rms",
     "rotation_rate": r"rpm|rotat|rotary|turntable",
     "supply_voltage": r"batt|supply|volt|(^|[^a-z])(v?bus|vcc|vdd|vin)",
     "light_power": r"light|optic|laser|sld|source",
@@ -56,7 +56,7 @@ def find_likely_channels(
     likely: defaultdict[str, list[LikelyChannel]] = defaultdict(list)
     for place, (name, unit) in enumerate(columns):
         for channel, words in _WORDS.items():
-            has_word = re.search(words, name.lower()) is not None
+            has_word = re.search(words, f"{name} {unit or ''}".lower()) is not None
             if not has_word and (unit is None or channel not in _KNOWN_BY_UNIT):
                 continue
             column = _read_unit(place, name, unit, QUANTITIES[channel])

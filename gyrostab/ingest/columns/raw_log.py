@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.arrays import Floats, Ints
+from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import Buffers, find_even
 from gyrostab.ingest.columns.plan import Column, Plan
@@ -21,6 +21,7 @@ from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import convert_values, read_slice, stack_rows
 from gyrostab.store.write import pack_counts
 from gyrostab.units import DAY
+from gyrostab.wording import list_some
 
 #: Largest number of bad places that a note lists.
 MAX_NAMED_PLACES = 10
@@ -34,6 +35,7 @@ _CODE_ROWS = 2**18
 _MIN_CODE_REPEATS, _MIN_CODE_DISTANCE, _MIN_READINGS = 3, 3.0, 16
 #: Common codes for missing values in well logs.
 _COMMON_CODES = (-999.25, -9999.0)
+_CODE_ROUNDING = 2.0**-23  # relative difference of equal numbers, one of single precision
 
 #: Row numbers within a block -> names of the rows for messages.
 Locate = Callable[[Sequence[int]], list[str]]
@@ -53,6 +55,7 @@ class ConvertedBlock(NamedTuple):
     #: Column number -> number of missing values, range of the others in the unit of the file, and
     #: whether these are whole numbers.
     ranges: dict[int, tuple[int, float, float, bool]]
+    declared: dict[int, int]  # column number -> number of missing values that were a code
     #: Unreadable rows, and other rows with an unreadable gyro cell.
     bad_rows: Ints
     cell_rows: Ints
@@ -67,6 +70,7 @@ class _Statistics:
 
     column: Column
     missing: int = 0
+    declared: int = 0  # number of those missing values that were a code
     is_whole: bool = True  # whether all numbers are whole, in the unit of the file
     reach: float = 0.0  # largest magnitude in that unit
     #: Extremes in the inner unit, with their rows.
@@ -124,10 +128,16 @@ class RawLogBuilder:
         )
         bad = stamps == NAT if stamps is not None else np.zeros(size, dtype=bool)
         bad_cells, ranges, masks = words + int(np.count_nonzero(bad)), {}, []
+        declared: dict[int, int] = {}
         for column in [*self.gyro, *self.channels]:
             cells = values[column.source]
-            ranges[column.source] = clean_column(cells, column.factor, column.offset)
-            masks.append(~np.isfinite(cells) if ranges[column.source][0] else None)
+            is_code = find_codes(cells, self.options.missing_value)
+            declared[column.source] = int(np.count_nonzero(is_code))
+            if declared[column.source]:
+                cells[is_code] = np.nan
+            missing, *_ = ranges[column.source] = clean_column(cells, column.factor, column.offset)
+            has_unreadable = missing > declared[column.source]
+            masks.append(~(np.isfinite(cells) | is_code) if has_unreadable else None)
         gyro = [mask for mask in masks[: len(self.gyro)] if mask is not None]
         bad_cells += sum(int(np.count_nonzero(mask)) for mask in gyro)
         if self.gyro and all(mask is not None for mask in masks):
@@ -136,7 +146,15 @@ class RawLogBuilder:
         cell_rows = np.flatnonzero(np.logical_or.reduce(cell_masks)) if cell_masks else _NO_ROWS
         n_cells = sum(int(np.count_nonzero(mask)) for mask in cell_masks)
         return ConvertedBlock(
-            size, values, stamps, ranges, np.flatnonzero(bad), cell_rows, bad_cells, n_cells
+            size,
+            values,
+            stamps,
+            ranges,
+            declared,
+            np.flatnonzero(bad),
+            cell_rows,
+            bad_cells,
+            n_cells,
         )
 
     def add(
@@ -148,6 +166,7 @@ class RawLogBuilder:
         first = self.buffers.rows
         for source, statistics in self.statistics.items():
             statistics.add(converted.values[source], first, *converted.ranges[source])
+            statistics.declared += converted.declared[source]
         locate = locate or (lambda rows: [f"row {first + row}" for row in rows])
         self.bad_rows.add(converted.bad_rows, locate, quote)
         self.cell_rows.add(converted.cell_rows, locate, quote)
@@ -186,6 +205,7 @@ class RawLogBuilder:
             *self.plan.notes,
             *notes,
             *describe_codes(self.statistics.values(), columns),
+            *self._describe_declared(),
             *self._describe_faults(rows),
             *(self.clock.describe() if self.clock is not None else ()),
         ]
@@ -221,12 +241,26 @@ class RawLogBuilder:
                 f"{written}; look at it, and check {suspects}"
             )
 
+    def _describe_declared(self) -> list[str]:
+        """Return a note on the cells that `missing_value` made missing."""
+        counts = [
+            f"{statistics.declared} of {statistics.column.header!r}"
+            for statistics in self.statistics.values()
+            if statistics.declared
+        ]
+        codes = " or ".join(f"{code:.10g}" for code in self.options.missing_value)
+        return [f"cells that are {codes} are missing: {list_some(counts, 5)}"] if counts else []
+
     def _describe_faults(self, rows: int) -> list[str]:
         """Return notes on unreadable rows, and on gyro cells in other rows."""
         notes, bad = [], self.bad_rows
         if bad.total:
             notes.append(f"{bad.total} of {rows} rows are unreadable: {bad.describe()}")
-        empty = sum(self.statistics[column.source].missing == rows for column in self.gyro)
+        unreadable = [
+            self.statistics[column.source].missing - self.statistics[column.source].declared
+            for column in self.gyro
+        ]
+        empty = unreadable.count(rows)
         cells = self.gyro_cells - empty * (rows - bad.total)  # empty axes have a note later
         if cells:
             places = "" if empty else f": {self.cell_rows.describe()}"
@@ -275,6 +309,21 @@ class RawLogBuilder:
         if self.options.start is not None and stamps is None:
             dataset.attrs["start"] = self.options.start
         return dataset
+
+
+def find_codes(values: Floats, codes: Sequence[float]) -> Bools:
+    """Return which values are one of the codes for missing values, up to single precision.
+
+    Examples
+    --------
+    >>> find_codes(np.array([0.5, -999.25, 999.99, np.nan]), (-999.25, float(np.float32(999.99))))
+    array([False,  True,  True, False])
+    """
+    is_code = np.zeros(values.shape, np.bool_)
+    with np.errstate(invalid="ignore"):
+        for code in codes:
+            is_code |= np.abs(values - code) <= _CODE_ROUNDING * abs(code)
+    return is_code
 
 
 def clean_column(values: Floats, factor: float, offset: float) -> tuple[int, float, float, bool]:
@@ -379,13 +428,14 @@ def describe_codes(columns: Iterable[_Statistics], values: Mapping[int, Any]) ->
         if code is None:
             continue
         count = int((readings == code).sum())
+        written = f"{(code - column.offset) / column.factor:.10g}"
         is_common = _is_common(code, common)
         place = f"{len(rows)} rows from row {begin} on" if begin else f"the first {len(rows)} rows"
         notes.append(
-            f"{column.header!r} is {(code - column.offset) / column.factor:.10g} in {count} of "
+            f"{column.header!r} is {written} in {count} of "
             f"{place}{', far outside all other values' if count < len(readings) else ''}; "
             f"{'it is a common' if is_common else 'if that is a'} code for a missing value"
-            f"{':' if is_common else ','} replace it by nan before the log is read"
+            f"{':' if is_common else ','} read it as missing with --missing-value {written}"
         )
     return notes
 

@@ -546,3 +546,55 @@ def test_a_common_code_among_few_readings_is_noted(tmp_path: Path) -> None:
     notes = [note for note in read_log(tmp_path / "log.csv").attrs["notes"] if "code" in note]
     assert len(notes) == 1
     assert "'temperature [degC]' is -999.25 in 150 of the first 3000 rows, far" in notes[0]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_declared_codes_are_missing_and_other_values_stay(
+    tmp_path: Path, suffix: str, dtype: type
+) -> None:
+    """Also where most rows have one: they are readable, unlike other cells without a number."""
+    random = np.random.default_rng(2)
+    gyro = random.standard_normal((2, 3000)).round(3)
+    is_code = random.random((2, 3000)) < 0.7
+    temperature = 20.0 + random.integers(0, 10, 3000)
+    is_cold = random.random(3000) < 0.1
+    table = pd.DataFrame({
+        "time [s]": np.arange(3000) / 10.0,
+        "gyro_x [deg/s]": np.where(is_code[0], -999.25, gyro[0]).astype(dtype),
+        "gyro_y [deg/s]": np.where(is_code[1], 999.99, gyro[1]).astype(dtype),
+        "temperature [degF]": np.where(is_cold, -999.25, temperature).astype(dtype),
+    })  # fmt: skip
+    path = tmp_path / f"log.{suffix}"
+    table.to_csv(path, index=False) if suffix == "csv" else table.to_parquet(path)
+    raw = read_log(path, missing_value=[-999.25, 999.99])
+    expected = np.where(is_code, np.nan, 3600.0 * gyro)
+    np.testing.assert_allclose(raw["rate"], expected, rtol=1e-6)
+    in_celsius = np.where(is_cold, np.nan, (temperature - 32.0) / 1.8)
+    np.testing.assert_allclose(raw["temperature"], in_celsius, rtol=1e-5, atol=1e-5)
+    assert raw.attrs["unreadable_rows"] == raw.attrs["unreadable_cells"] == 0
+    (note,) = (note for note in raw.attrs["notes"] if "cells that" in note)
+    assert note == (
+        f"log.{suffix}: cells that are -999.25 or 999.99 are missing: {is_code[0].sum()} of "
+        f"'gyro_x [deg/s]', {is_code[1].sum()} of 'gyro_y [deg/s]', {is_cold.sum()} of "
+        "'temperature [degF]'"
+    )
+
+
+def test_a_declared_code_hides_no_unreadable_cell(tmp_path: Path) -> None:
+    rows = ["time [s],gyro_x [deg/s]", *(f"{i / 10},{i % 7}" for i in range(100))]
+    rows[5], rows[9] = "0.4,-999.25", "0.8,oops"
+    path = write(tmp_path, "\n".join(rows) + "\n")
+    raw = read_log(path, missing_value=-999.25)
+    assert np.flatnonzero(np.isnan(raw["rate"].values[0])).tolist() == [4, 8]
+    assert raw.attrs["unreadable_rows"] == 1
+    assert "line 10 ('oops')" in raw.attrs["notes"][-1]
+    # without the option, the code is a value
+    assert read_log(path)["rate"].values[0, 4] == -999.25 * 3600.0
+
+
+@pytest.mark.parametrize("code", [np.nan, np.inf, "-", [0.0, "x"]])
+def test_a_code_is_a_number(tmp_path: Path, code: object) -> None:
+    path = write(tmp_path, "time [s],gyro_x [deg/s]\n0.0,1\n0.1,2\n")
+    with pytest.raises(OptionError, match=r"missing-value .*: give a number such as"):
+        read_log(path, missing_value=code)
