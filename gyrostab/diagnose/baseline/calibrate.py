@@ -6,6 +6,8 @@ B and K. The posterior is kept as draws, so that null records include the calibr
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,7 @@ from gyrostab.diagnose.baseline.posterior import (
     with_floor,
 )
 from gyrostab.diagnose.baseline.quiescent import find_quiescent_blocks, find_quiescent_spans
+from gyrostab.diagnose.predict.filter_response import logger_responses
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.errors import SchemaError
 
@@ -78,12 +81,18 @@ def calibrate_noise(
 
 
 def calibrate_on_training_blocks(
-    blocks: xr.Dataset, baseline: xr.Dataset, training: Bools, *, settings: Settings = DEFAULTS
+    blocks: xr.Dataset,
+    baseline: xr.Dataset,
+    training: Bools,
+    *,
+    responses: Callable[[], Floats] | None = None,
+    settings: Settings = DEFAULTS,
 ) -> xr.Dataset:
     """Calibrate the noise again on the quiescent blocks among the training blocks (block,).
 
     A baseline that is not that of `calibrate_noise` is returned as it is, and so is one of which
-    too few such blocks have a spectrum.
+    too few such blocks have a spectrum. `responses` gives the `logger_responses` of the blocks,
+    which are the same for any training blocks; they are computed if it is not given.
     """
     has_spectrum = np.isfinite(blocks["power"].values).any(axis=-1)
     quiescent = baseline["quiet"].values & training & has_spectrum
@@ -93,16 +102,22 @@ def calibrate_on_training_blocks(
         or quiescent.sum(axis=1).min() < settings.min_quiescent_blocks
     ):
         return baseline
-    posteriors = calibrate_axes(blocks, quiescent, settings)
+    posteriors = calibrate_axes(blocks, quiescent, settings, responses)
     return assemble_baseline(
         blocks, posteriors, quiescent=quiescent, attrs=baseline.attrs, settings=settings
     )
 
 
-def calibrate_axes(blocks: xr.Dataset, quiescent: Bools, settings: Settings) -> list[Posterior]:
+def calibrate_axes(
+    blocks: xr.Dataset,
+    quiescent: Bools,
+    settings: Settings,
+    responses: Callable[[], Floats] | None = None,
+) -> list[Posterior]:
     """Compute the noise of every axis from its quiescent blocks (axis, block)."""
     posteriors = []
-    for row, bands in enumerate(_fit_quiescent_powers(blocks, quiescent, settings)):
+    responses = responses or partial(logger_responses, blocks)
+    for row, bands in enumerate(_fit_quiescent_powers(blocks, quiescent, responses, settings)):
         explained = keep_explained_bands(bands, settings)
         square = with_floor(fit_squares(explained)[0], explained)
         variance = white_variance(blocks, square[None])[row]
@@ -140,7 +155,7 @@ def _level_columns(quiescent: Bools, min_blocks: int) -> Floats:
 
 
 def _fit_quiescent_powers(
-    blocks: xr.Dataset, quiescent: Bools, settings: Settings
+    blocks: xr.Dataset, quiescent: Bools, responses: Callable[[], Floats], settings: Settings
 ) -> list[BandPowers]:
     """Return the powers of every axis as a sum of noise terms, behind a filter if it takes one.
 
@@ -152,7 +167,7 @@ def _fit_quiescent_powers(
         or min(bands.power.size for bands in bands_by_axis) < blocks.sizes["band"]
     ):
         return bands_by_axis
-    response = fit_filter_response(blocks, bands_by_axis, settings=settings)
+    response = fit_filter_response(responses(), bands_by_axis, settings=settings)
     if response is None:
         return bands_by_axis
     filtered = _average_quiescent(blocks, quiescent, noise_powers(blocks, response))

@@ -13,11 +13,8 @@ from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.baseline.axis_means import AxisMeans
 from gyrostab.diagnose.baseline.expected_statistics import B_TERM, K_TERM, N_TERM
 from gyrostab.diagnose.evidence.wandering import RandomProcesses, no_processes
-from gyrostab.diagnose.predict.filter_response import band_response
-from gyrostab.diagnose.predict.windows import make_windows
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.regression.nonnegative import solve_nonnegative
-from gyrostab.physics.sampling import LoggerFilter
 from gyrostab.units import HOUR
 
 #: Number of draws from the posterior of the noise of an axis; limits memory.
@@ -206,7 +203,7 @@ def _eliminate_free_sizes(
 
 
 def fit_filter_response(
-    blocks: xr.Dataset, bands_by_axis: Sequence[BandPowers], *, settings: Settings = DEFAULTS
+    responses: Floats, bands_by_axis: Sequence[BandPowers], *, settings: Settings = DEFAULTS
 ) -> Floats | None:
     """Return the response (band, term) of the filter that describes the powers of all axes best.
 
@@ -216,21 +213,17 @@ def fit_filter_response(
 
     All axes pass the one logger: None if the noise terms alone describe some axis about as well.
     """
-    responses = [
-        band_response(LoggerFilter.example(**values), blocks)
-        for values in LoggerFilter.example().points(make_windows(blocks, {}))
-    ]
     nats, quantization = [], []
     for bands in bands_by_axis:
         square, _, expected = _fit_noise_alone(
-            bands, bands.columns * np.stack([np.ones_like(responses[0]), *responses])
+            bands, bands.columns * np.concatenate([np.ones_like(responses[:1]), responses])
         )
         nats.append(_log_likelihood(bands, expected))
         quantization.append(square[1:, 0])
     nats_without, nats_behind = np.split(np.array(nats), [1], axis=1)
     chosen = choose_filter(nats_behind.sum(axis=0), np.sum(quantization, axis=0), settings)
     is_better = nats_behind[:, chosen] > nats_without[:, 0] + settings.ambiguous_nats
-    return responses[chosen] if is_better.all() else None
+    return np.asarray(responses[chosen]) if is_better.all() else None
 
 
 def fit_behind(bands: BandPowers, columns: Floats) -> tuple[float, float]:

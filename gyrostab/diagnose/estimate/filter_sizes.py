@@ -45,7 +45,10 @@ def fit_filter_sizes(
     columns = band_columns(state.blocks)
 
     def fit_all(values: Mapping[str, Any]) -> list[tuple[float, float]]:
-        response = band_response(kind.example(**values), state.blocks)
+        response = state.recall(
+            lambda: band_response(kind.example(**values), state.blocks),
+            f"{kind.name} {sorted(values.items())}".encode(),
+        )
         return [fit_behind(bands, mixing @ (columns * response)) for bands, mixing in axis_powers]
 
     def likelihood(values: Mapping[str, Any]) -> float:
@@ -56,8 +59,9 @@ def fit_filter_sizes(
         for variant in components[0].candidate.variants
         if components[0].statistic.is_filter(variant)
     ]
-    family += _best_sizes(family, likelihood)
     behind = [fit_all(values) for values in family]
+    between = _best_sizes(family, np.array(behind).sum(axis=1)[:, 0], likelihood)
+    family, behind = family + between, behind + [fit_all(values) for values in between]
     log, quantization = np.array(behind).sum(axis=1).T
     best = family[choose_filter(log, quantization, state.settings)]
     name = "cutoff" if best["cutoff"] else "length"
@@ -87,21 +91,25 @@ def fit_filter_sizes(
 
 
 def _best_sizes(
-    family: Sequence[Mapping[str, Any]], likelihood: Callable[[Mapping[str, Any]], float]
-) -> list[dict[str, Any]]:
+    family: Sequence[Mapping[str, Any]],
+    log: Floats,
+    likelihood: Callable[[Mapping[str, Any]], float],
+) -> list[Mapping[str, Any]]:
     """Return the likeliest cutoff of each kind of low-pass, between its neighbours on the grid.
 
-    A strong filter has a narrower likelihood than the grid is fine.
+    A strong filter has a narrower likelihood than the grid is fine. `log` has the log likelihoods
+    of the family.
     """
-    kinds: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
-    for values in family:
+    kinds: dict[tuple[Any, ...], list[int]] = {}
+    for place, values in enumerate(family):
         if values["cutoff"]:
             kind = tuple(value for name, value in values.items() if name != "cutoff")
-            kinds.setdefault(kind, []).append(values)
-    likeliest = []
-    for low_passes in kinds.values():
-        best = max(range(len(low_passes)), key=lambda place: likelihood(low_passes[place]))
-        values, cutoffs = low_passes[best], [float(point["cutoff"]) for point in low_passes]
+            kinds.setdefault(kind, []).append(place)
+    likeliest: list[Mapping[str, Any]] = []
+    for places in kinds.values():
+        best = int(np.argmax(log[places]))
+        values = family[places[best]]
+        cutoffs = [float(family[place]["cutoff"]) for place in places]
         minimum = minimize_scalar(
             lambda cutoff: -likelihood({**values, "cutoff": cutoff}),  # noqa: B023
             bounds=(cutoffs[max(best - 1, 0)], cutoffs[min(best + 1, len(cutoffs) - 1)]),

@@ -21,6 +21,7 @@ from gyrostab.noise import sampled_psd
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Prediction
 from gyrostab.physics.registry import effects
+from gyrostab.physics.sampling import LoggerFilter
 
 _SIZE_COUNT = 50  # filter sizes that are tried; limits resolution
 _MIN_PASSED_SHARE = 0.002  # smallest passed share that is tried, besides 0
@@ -52,6 +53,12 @@ def band_response(effect: Effect, blocks: xr.Dataset) -> Floats:
         passed = _split_into_bands(power * response).mean(axis=1)
         factors.append(passed / _split_into_bands(power).mean(axis=1))
     return np.stack(factors, axis=-1)
+
+
+def logger_responses(blocks: xr.Dataset) -> Floats:
+    """Return the responses (filter, band, term) of the filters that a logger may have."""
+    points = LoggerFilter.example().points(make_windows(blocks, {}))
+    return np.stack([band_response(LoggerFilter.example(**values), blocks) for values in points])
 
 
 def with_band_response(prediction: Prediction, effect: Effect, blocks: xr.Dataset) -> Prediction:

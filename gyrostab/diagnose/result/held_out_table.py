@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from itertools import compress
 
 import numpy as np
@@ -24,6 +24,7 @@ from gyrostab.diagnose.evidence.products import axis_noise, mean_products
 from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.identify.selections import Selection, components_of
 from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.filter_response import logger_responses
 from gyrostab.diagnose.reduce.schema import pair_indices
 from gyrostab.diagnose.result.active_spans import active_blocks
 from gyrostab.diagnose.settings import Settings
@@ -72,12 +73,13 @@ def measure_held_out(
 
     settings = identifications.state.settings
     calibrated: dict[bytes, xr.Dataset] = {}  # by the training blocks
+    responses = cache(partial(logger_responses, blocks))
 
     def calibrate(training: Bools) -> xr.Dataset:
         place = training.tobytes()
         if place not in calibrated:
             calibrated[place] = calibrate_on_training_blocks(
-                blocks, baseline, training, settings=settings
+                blocks, baseline, training, responses=responses, settings=settings
             )
         return calibrated[place]
 
