@@ -14,7 +14,7 @@ from gyrostab.diagnose.evidence.folds import FOLDS
 from gyrostab.diagnose.evidence.wandering import RandomProcesses, expected_processes, no_processes
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.kernels.regression.evidence import mixed_evidence, row_products
-from gyrostab.kernels.regression.state_space import flicker_states, whiten
+from gyrostab.kernels.regression.state_space import flicker_states, products_on_grid, whiten
 from gyrostab.units import HOUR
 
 #: Standard deviations of the prior of a size, in units of its error in white noise. Design
@@ -26,6 +26,7 @@ _MAX_WIDTH = 1e6
 #: A design that keeps a smaller share of its square, after constants and given columns are
 #: projected out, counts as absent. Above rounding errors.
 _MIN_SQUARE_SHARE = 1e-9
+_FEW_COLUMNS = 8  # of which all products are computed at once
 _MAX_PRODUCTS_AT_ONCE = 100_000  # designs times records times grid points; limits memory
 
 
@@ -121,10 +122,26 @@ def mean_products(
     stacked = np.ascontiguousarray(np.concatenate([columns, values], axis=1))
     stacked[~present] = 0.0
     white_variance = np.where(present, variance, 1.0)
-    share, time, white = flicker_states(step, n * step)
+    flicker = share, time, white = flicker_states(step, n * step)
     steps = np.full(n, step)
     if wander is None:
         wander = no_processes(n)
+    if pairs is None and stacked.shape[1] <= _FEW_COLUMNS:
+        of_all, determinant = products_on_grid(
+            stacked,
+            white_variance,
+            steps,
+            present,
+            wander.walk,
+            K**2 / HOUR,
+            B**2,
+            flicker,
+            wander.square,
+            wander.time,
+            float(wander.angle),
+        )
+        square = np.diagonal(of_all, axis1=1, axis2=2)[:, width:]
+        return Products(square, of_all[:, :width, width:], of_all[:, :width, :width], determinant)
     squares, times = np.append(share, wander.square), np.append(time, wander.time)
     shape = (K.size, values.shape[1])
     square, cross = np.empty(shape), np.empty((K.size, width, shape[1]))

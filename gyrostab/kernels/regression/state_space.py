@@ -207,3 +207,63 @@ def whiten(
         _subtract_gain(covariance, gain, F)
         total += np.log(F)
     return out, total
+
+
+@njit(**KERNEL)
+def products_on_grid(
+    columns: Floats,
+    variance: Floats,
+    step_seconds: Floats,
+    present: Bools,
+    walk: Floats,
+    K2: Floats,
+    B2: Floats,
+    flicker: tuple[Floats, Floats, float],
+    ou_variance: Floats,
+    ou_time: Floats,
+    angle: float,
+) -> tuple[Floats, Floats]:
+    """Compute the products of whitened columns for many sizes of the random walk and the flicker.
+
+    Parameters
+    ----------
+    columns, variance, step_seconds, present, ou_variance, ou_time, angle
+        As for `whiten`; the processes are those in addition to the flicker.
+    walk : ndarray, shape (n,)
+        Growth of the variance in a second of a random walk of known size, in every block.
+    K2, B2 : ndarray, shape (grid,)
+        Growth of that of the random walk, and square of the flicker.
+    flicker : tuple
+        The `flicker_states`.
+
+    Returns
+    -------
+    products : ndarray, shape (grid, m, m)
+    log_determinant : ndarray, shape (grid,)
+    """
+    n, width = columns.shape
+    share, flicker_time, white = flicker
+    products = np.zeros((K2.size, width, width))
+    log_determinant = np.zeros(K2.size)
+    for g in range(K2.size):
+        count = share.size if B2[g] > 0.0 else 0
+        squares = np.concatenate((share[:count] * B2[g], ou_variance))
+        times = np.concatenate((flicker_time[:count], ou_time))
+        whitened, log_determinant[g] = whiten(
+            columns,
+            variance + B2[g] * white,
+            step_seconds,
+            present,
+            walk + K2[g],
+            squares,
+            times,
+            angle,
+        )
+        for i in range(n):
+            for j in range(width):
+                for k in range(j + 1):
+                    products[g, j, k] += whitened[i, j] * whitened[i, k]
+        for j in range(width):
+            for k in range(j):
+                products[g, k, j] = products[g, j, k]
+    return products, log_determinant

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gyrostab.kernels.regression.state_space import flicker_states, whiten
+from gyrostab.kernels.regression.state_space import flicker_states, products_on_grid, whiten
 
 
 def walk_covariance(edges: np.ndarray) -> np.ndarray:
@@ -155,3 +155,26 @@ def test_sum_of_processes_approximates_flicker_noise():
     lag = np.arange(1, n)
     variogram = 2.0 * (covariance[0] + white - covariance[1:])
     np.testing.assert_allclose(variogram, flicker_variogram(lag), rtol=0.05)
+
+
+@given(seed=st.integers(0, 10**6), angle=st.sampled_from([0.0, 30.0]))
+def test_products_on_a_grid_are_those_of_each_point(seed, angle):
+    rng = np.random.default_rng(seed)
+    n, step = 40, 20.0
+    columns, present = rng.standard_normal((n, 3)), rng.random(n) > 0.2
+    variance, walk = rng.uniform(0.5, 2.0, n), rng.uniform(0.0, 0.01, n)
+    K2, B2 = np.array([0.0, 0.02, 1.0]), np.array([3.0, 0.0, 0.1])
+    flicker = share, time, white = flicker_states(step, n * step)
+    other = np.array([0.7]), np.array([55.0])
+    steps = np.full(n, step)
+    products, determinant = products_on_grid(
+        columns, variance, steps, present, walk, K2, B2, flicker, *other, angle
+    )
+    for g, (k, b) in enumerate(zip(K2, B2, strict=True)):
+        squares = np.append(share * b, other[0]) if b else other[0]
+        times = np.append(time, other[1]) if b else other[1]
+        expected, log_determinant = dense(
+            columns, variance + b * white, steps, present, walk + k, squares, times, angle
+        )
+        np.testing.assert_allclose(products[g], expected, rtol=1e-6, atol=1e-8)
+        assert determinant[g] == pytest.approx(log_determinant, rel=1e-9, abs=1e-7)
