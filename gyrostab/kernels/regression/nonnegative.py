@@ -10,12 +10,14 @@ from gyrostab.arrays import Floats
 #: Share of the square of a column that free ones leave, below which it counts as one of them. Above
 #: rounding errors.
 _MIN_APART = 1e-8
+_UNIT = 1.0 + 1e-12  # square of a scaled column, so that a system can be solved
 
 
 def solve_nonnegative(normal: Floats, right: Floats) -> Floats:
     """Minimise ``s^T normal s - 2 right^T s`` over ``s >= 0``.
 
-    The solution is exact: of five terms there are at most 31 subsets, and all are tried.
+    The solution is exact: it is that of any sizes if none of these is negative; otherwise all
+    subsets are tried, at most 31 of five terms.
 
     Parameters
     ----------
@@ -31,20 +33,29 @@ def solve_nonnegative(normal: Floats, right: Floats) -> Floats:
     >>> solve_nonnegative(np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0]))
     array([0.5, 0. ])
     """
-    width = right.shape[-1]
-    every = np.arange(width)
+    every = np.arange(right.shape[-1])
     square = normal[..., every, every]
     scale = np.where(square > 0.0, 1.0 / np.sqrt(np.where(square > 0.0, square, 1.0)), 0.0)
-    scaled_right = (right * scale)[..., None, :]
-    members = (np.arange(1 << width)[:, None] >> every & 1).astype(np.float64)
-    systems = (normal * scale[..., None] * scale[..., None, :])[..., None, :, :]
-    systems = systems * members[:, :, None] * members[:, None, :]
-    systems[..., every, every] = 1.0 + 1e-12  # also of the terms that a subset lacks
-    trials = np.linalg.solve(systems, (members * scaled_right)[..., None])[..., 0]
-    gains = np.where((trials >= 0.0).all(axis=-1), (trials * scaled_right).sum(axis=-1), -np.inf)
-    best = gains.argmax(axis=-1)[..., None, None]
-    chosen = np.abs(np.take_along_axis(trials, best, axis=-2))  # without a negative zero
-    return np.asarray(chosen[..., 0, :] * scale)
+    scaled_right = right * scale
+    scaled = normal * scale[..., None] * scale[..., None, :]
+    scaled[..., every, every] = _UNIT
+    sizes = np.linalg.solve(scaled, scaled_right[..., None])[..., 0]
+    is_outside = ~(sizes >= 0.0).all(axis=-1)
+    if is_outside.any():
+        sizes[is_outside] = _solve_by_subsets(scaled[is_outside], scaled_right[is_outside])
+    return np.asarray(np.abs(sizes) * scale)  # without a negative zero
+
+
+def _solve_by_subsets(normal: Floats, right: Floats) -> Floats:
+    """Try all subsets of terms of many systems, (system, n, n) and (system, n)."""
+    every = np.arange(right.shape[-1])
+    members = (np.arange(1 << every.size)[:, None] >> every & 1).astype(np.float64)
+    systems = normal[:, None] * members[:, :, None] * members[:, None, :]
+    systems[..., every, every] = _UNIT  # also of the terms that a subset lacks
+    trials = np.linalg.solve(systems, (members * right[:, None])[..., None])[..., 0]
+    gains = np.where((trials >= 0.0).all(axis=-1), (trials * right[:, None]).sum(axis=-1), -np.inf)
+    best = gains.argmax(axis=-1)[:, None, None]
+    return np.asarray(np.take_along_axis(trials, best, axis=1)[:, 0])
 
 
 def solve_bounded(normal: Floats, right: Floats, low: Floats) -> Floats:

@@ -19,6 +19,20 @@ def test_nonnegative_solution_is_optimal():
         np.testing.assert_allclose(design @ solution, design @ expected, atol=1e-5)
 
 
+def test_many_systems_have_the_solutions_of_each():
+    """Some inside the range, and some at its edge."""
+    rng = np.random.default_rng(17)
+    design = np.abs(rng.standard_normal((40, 12, 4)))
+    data = rng.standard_normal((40, 12)) + 2.0
+    normal = np.swapaxes(design, 1, 2) @ design
+    right = (np.swapaxes(design, 1, 2) @ data[..., None])[..., 0]
+    solutions = solve_nonnegative(normal, right)
+    at_zero = (solutions == 0.0).any(axis=1)
+    assert 0 < at_zero.sum() < 40
+    for solution, one_design, one_data in zip(solutions, design, data, strict=True):
+        np.testing.assert_allclose(solution, nnls(one_design, one_data)[0], atol=1e-8)
+
+
 def test_some_sizes_are_bounded():
     rng = np.random.default_rng(15)
     at_bound = 0
