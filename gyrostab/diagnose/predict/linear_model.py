@@ -106,7 +106,7 @@ def unspread_share(blocks: xr.Dataset, row: str = "axis") -> Array:
     Shape (axis or pair, block). Random gaps spread the rest over all frequencies. The missing
     neighbours at the tapered ends of a block spread nothing.
     """
-    neighbours = blocks["neighbours" if row == "axis" else "cross_neighbours"].values
+    neighbours = blocks.variables["neighbours" if row == "axis" else "cross_neighbours"].values
     weights = taper(int(blocks.attrs["block_samples"]))
     without_gaps = float((weights[1:] * weights[:-1]).sum() / (weights**2).sum())
     return np.minimum(
@@ -153,10 +153,8 @@ def select_row(density: Array, row: int) -> Array:
 
 def pair_rows(blocks: xr.Dataset) -> list[tuple[str, ...]]:
     """Return the two axes of each pair."""
-    return [
-        (str(a), str(b))
-        for a, b in zip(blocks["first"].values, blocks["second"].values, strict=True)
-    ]
+    first, second = (blocks.variables[name].values for name in ("first", "second"))
+    return [(str(a), str(b)) for a, b in zip(first, second, strict=True)]
 
 
 def moves_within_blocks(
@@ -258,9 +256,12 @@ def expected_cross(baseline: xr.Dataset) -> Array | None:
 
 def reference_channel_power(name: str, blocks: xr.Dataset) -> Array:
     """Return the power of a channel on the log's time, or of an axis as measured, (block, band)."""
-    if name in blocks["axis"].values:
-        return np.asarray(read_as_measured(blocks, "power").sel(axis=name).values)
-    return np.asarray(blocks["reference_power"].sel(reference=name).values)
+    variables = blocks.variables
+    axes = variables["axis"].values.tolist()
+    if name in axes:
+        return np.asarray(read_as_measured(blocks, "power").values[axes.index(name)])
+    place = variables["reference"].values.tolist().index(name)
+    return np.asarray(variables["reference_power"].values[place])
 
 
 def with_correlated_powers(prediction: Prediction, blocks: xr.Dataset) -> Prediction:

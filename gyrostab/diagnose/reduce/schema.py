@@ -248,9 +248,9 @@ def pair_indices(blocks: xr.Dataset) -> Ints:
     return np.array(sides, np.int64)
 
 
-def read_as_measured(blocks: xr.Dataset, name: str) -> xr.DataArray:
+def read_as_measured(blocks: xr.Dataset, name: str) -> xr.Variable:
     """Return a variable of the block statistics as measured, including what motion left out."""
-    return blocks[f"measured_{name}"] if f"measured_{name}" in blocks else blocks[name]
+    return blocks.variables.get(f"measured_{name}", blocks.variables[name])
 
 
 def format_time(blocks: xr.Dataset, seconds: float) -> str:

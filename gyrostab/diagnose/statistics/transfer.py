@@ -137,10 +137,10 @@ def reference_channel_of(
 
     Shapes (block, band, record) and (block, band). Expected cross-spectra are subtracted.
     """
-    axes = [str(axis) for axis in blocks["axis"].values]
+    axes = [str(axis) for axis in blocks.variables["axis"].values]
     if name in axes:
         cross = records_last(read_as_measured(data, "cross").values, 3)
-        has_power = np.isfinite(blocks["power"].values[row])[..., None]
+        has_power = np.isfinite(blocks.variables["power"].values[row])[..., None]
         expected = expected_cross(baseline)
         cross = cross if expected is None else cross - expected[..., None]
         cross_power = np.full(cross.shape[1:], np.nan + 0j)
@@ -174,7 +174,9 @@ def _moving_share(name: str, power: Array, state: State) -> Array:
 
 
 def _reference_channels(blocks: xr.Dataset) -> list[str]:
-    return list(map(str, blocks["reference"].values)) if "reference" in blocks.dims else []
+    return (
+        list(map(str, blocks.variables["reference"].values)) if "reference" in blocks.dims else []
+    )
 
 
 def _unknown_channels(blocks: xr.Dataset) -> list[str]:
