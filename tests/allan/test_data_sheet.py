@@ -11,7 +11,7 @@ from tests.support.noise_records import flicker, mixture
 RATE, SAMPLES, RECORDS = 10.0, 6000, 400
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_sensors_at_their_limits_rarely_pass_or_fail():
     limits = {"N": 0.01, "B": 0.3, "K": 4.0}
     rng = np.random.default_rng(3)

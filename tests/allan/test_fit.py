@@ -344,7 +344,7 @@ def test_interval_of_a_marginal_ramp_on_a_strong_random_walk_holds():
     assert 0.92 <= float(held.mean()) <= 0.99
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_intervals_of_n_and_b_hold_where_four_terms_compete():
     """N and B are too high where another term is dropped; the binomial sd of a share is 0.6 %."""
     rng = np.random.default_rng(14)

@@ -88,7 +88,7 @@ def test_coarse_quantization_grid_is_not_a_dead_zone(open_recording: Callable[..
     }
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_platform_sway_is_real_motion(open_recording: Callable[..., Any]) -> None:
     diagnosis = gyrostab.diagnose(open_recording("rlg-static-30min", end=180.0), nulls=100)
     assert "real_motion" in named_effects(diagnosis)

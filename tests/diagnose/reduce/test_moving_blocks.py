@@ -329,7 +329,7 @@ def test_too_few_samples_at_rest_cannot_be_calibrated(sparse_at_rest):
         calibrate_noise(without_motion(sparse_at_rest, whole, find_moving_blocks(whole)))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_diagnosis_includes_motion_when_the_rest_cannot_be_calibrated(sparse_at_rest):
     with pytest.warns(UserWarning, match="includes unexplained motion.*axis z"):
         diagnosis = diagnose(sparse_at_rest, nulls=100)

@@ -80,7 +80,7 @@ def test_a_rate_that_is_not_round_a_clock_that_drifts_and_a_gap():
     assert log.attrs["sampling_rate_hz"] == pytest.approx(99.7 / (1 + 30e-6), rel=3e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_jitter_at_random_in_every_way():
     combinations = list(itertools.product(JITTER, LOSSES))
 
