@@ -35,8 +35,14 @@ def pytest_collection_finish() -> None:
 
 
 #: Tests that start first. The first file compiles most kernels that others share; the next ones
-#: need few of them, so that another worker does not compile the same kernels meanwhile.
-_FIRST = ("tests/allan/test_band_limit.py", "tests/ingest/")
+#: need none of these, so that another worker does not compile the same kernels meanwhile.
+_FIRST = (
+    "tests/allan/test_band_limit.py",
+    "tests/ingest/columns/test_read_dates.py",
+    "tests/ingest/formats/",
+    "tests/ingest/text/",
+    "tests/ingest/grid/",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
