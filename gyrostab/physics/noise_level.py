@@ -23,6 +23,9 @@ from gyrostab.units import HOUR, INNER
 #: Least N^2 of a polynomial law, as a share of its value at the reference (a tenth of N). Outside
 #: of the range where it was measured, the polynomial could be negative.
 LEAST_SHARE = 0.01
+#: Share of a record beyond the value of a channel that stands for the end of its range, so that a
+#: few wrong values do not count. Design choice.
+_END_SHARE = 0.05
 #: Resonances of a mount that are tried, as shares of the sampling rate, and their qualities. The
 #: bands of a spectrum, each 1.5 times as wide as the one below, do not resolve more.
 _RESONANCE_SHARES = (0.045, 0.08, 0.14, 0.25, 0.45)
@@ -100,6 +103,14 @@ class TemperatureNoise(Effect):
         return replace(
             self, reference=at, linear=self.linear + 2.0 * self.quadratic * (at - self.reference)
         )
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
+        """Take a low temperature of the record as reference: outside of it N is an extrapolation.
+
+        About the mean, the square of the temperature would have the form of any slow event.
+        """
+        low = np.quantile(windows.drivers["temperature"], _END_SHARE)
+        return {"reference": np.array([np.round(low)])}
 
     def generate(self, chunk: Chunk, state: Any) -> tuple[dict[str, Floats], Any]:
         above = chunk.drivers["temperature"] - self.reference
@@ -187,6 +198,11 @@ class LightPowerNoise(Effect):
         return replace(
             self, thermal=thermal / scale, shot=shot / scale, nominal=drivers["light_power"]
         )
+
+    def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
+        """Take a high power of the record as nominal: outside of it N is an extrapolation."""
+        high = np.quantile(windows.drivers["light_power"], 1.0 - _END_SHARE)
+        return {"nominal": np.array([float(f"{high:.3g}")])}
 
     def courses(self) -> tuple[str, ...]:
         """List the light power, because the effect divides by it."""

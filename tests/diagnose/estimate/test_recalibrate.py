@@ -14,7 +14,7 @@ from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.estimate.conditioned_baseline import predict_baseline
 from gyrostab.diagnose.estimate.constant_rate import fit_white_noise
 from gyrostab.diagnose.estimate.joint_fit import fit_identifications
-from gyrostab.diagnose.estimate.recalibrate import recalibrate, with_noise
+from gyrostab.diagnose.estimate.recalibrate import recalibrate, refer_to_kept_noise, with_noise
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.forms import choose_forms
 from gyrostab.diagnose.identify.selections import Selection
@@ -121,8 +121,10 @@ def test_noise_is_that_of_the_form_in_the_model():
     fit = conclude.refit_with_noise(identifications, baseline, first)
     (size,) = fit.fitted[0].parameters.values()
     assert set(fit.fitted[0].parameters) == {"linear"}
-    mean = float(blocks["channel_temperature"].mean()) - 25.0
-    level = noise_coefficient(fit.noise, "N")[0] ** 2 * (1.0 + size.value * mean)
+    effect = fit.fitted[0].effect
+    above = float(blocks["channel_temperature"].mean()) - effect.reference
+    assert effect.reference in (50.0, 51.0)  # of 50 to 60
+    level = noise_coefficient(fit.noise, "N")[0] ** 2 * (1.0 + size.value * above)
     assert level == pytest.approx(noise_coefficient(baseline, "N")[0] ** 2, rel=0.03)
 
 
@@ -183,21 +185,24 @@ def test_white_noise_of_a_model_gives_the_power_of_the_record_with_its_effects()
     assert white == pytest.approx({"x": 0.003}, rel=0.02)
 
 
-def test_noise_that_changes_far_from_its_reference_has_the_level_of_the_record():
-    """Nothing determines N at 25 degrees: the model keeps that of the record at its temperature."""
+def test_noise_that_follows_temperature_refers_to_that_of_the_record():
+    """Nothing determines N at 25 degrees."""
     heat = HEAT | {"points": [[0, 58], [600, 58], [601, 62], [1200, 62], [1201, 66], [1800, 66]]}
     truth = {"name": "temperature_noise", "linear": 0.12, "reference": 62.0, "axes": ["x"]}
     blocks = reduce_simulation(truth, environment=[heat])
     baseline = calibrate_noise(blocks)
     identifications = identify_by_hand(blocks, baseline, "temperature_noise", "power", ("linear",))
-    fit = conclude.refit_with_noise(
-        identifications, baseline, fit_identifications(identifications, baseline)
-    )
-    assert "x" not in fit.noise.attrs.get("recalibrated", ())
-    effect, level = fit.fitted[0].effect, noise_coefficient(fit.noise, "N")[0] ** 2
-    for degrees in (58.0, 62.0, 66.0):
-        squared_noise = level * (1.0 + effect.linear * (degrees - effect.reference))
-        assert squared_noise == pytest.approx(0.003**2 * (1.0 + 0.12 * (degrees - 62.0)), rel=0.12)
+    first = fit_identifications(identifications, baseline)
+    fit = conclude.refit_with_noise(identifications, baseline, first)
+    assert fit.noise.attrs["recalibrated"] == ["x"]
+    kept = refer_to_kept_noise(first, baseline, blocks)  # where the noise is not calibrated again
+    for fitted, noise in ((fit.fitted, fit.noise), (kept, baseline)):
+        effect, level = fitted[0].effect, noise_coefficient(noise, "N")[0] ** 2
+        assert effect.reference == pytest.approx(58.0, abs=0.5)
+        for degrees in (58.0, 62.0, 66.0):
+            squared_noise = level * (1.0 + effect.linear * (degrees - effect.reference))
+            true = 0.003**2 * (1.0 + 0.12 * (degrees - 62.0))
+            assert squared_noise == pytest.approx(true, rel=0.12)
     assert "at 58 degC" in fit.fitted[0].say()
 
 
