@@ -23,8 +23,8 @@ from gyrostab.units import HOUR, INNER
 #: Least N^2 of a polynomial law, as a share of its value at the reference (a tenth of N). Outside
 #: of the range where it was measured, the polynomial could be negative.
 LEAST_SHARE = 0.01
-#: Share of a record beyond the value of a channel that stands for the end of its range, so that a
-#: few wrong values do not count. Design choice.
+#: Share of a record that is left out at an end of the range of a channel, where a few values may be
+#: wrong. Design choice.
 _END_SHARE = 0.05
 #: Resonances of a mount that are tried, as shares of the sampling rate, and their qualities. The
 #: bands of a spectrum, each 1.5 times as wide as the one below, do not resolve more.
