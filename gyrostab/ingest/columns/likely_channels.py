@@ -16,8 +16,8 @@ from gyrostab.ingest.columns.headers import (
 )
 from gyrostab.units import parse_unit
 
-#: Channel -> words in the name or unit of its column; a unit of temperature or pressure in the
-#: header needs no word.
+#: Channel -> words in the name of its column; a unit of temperature or pressure in the header needs
+#: no word.
 _WORDS = {
     "temperature": TEMPERATURE_PATTERN.pattern,
     "pressure": r"press|baro",
@@ -27,6 +27,7 @@ _WORDS = {
     "light_power": r"light|optic|laser|sld|source",
 }
 _KNOWN_BY_UNIT = ("temperature", "pressure")
+_RMS_UNIT = re.compile(r"\brms\b", re.IGNORECASE)  # of an acceleration: that of a vibration
 #: Channels of three axes, known by their unit -> word in their names, if the unit has two meanings.
 _VECTORS = {"accel": "acc", "mag": "mag"}
 
@@ -52,11 +53,15 @@ def find_likely_channels(
     >>> likely = find_likely_channels([("Tool Temp", "degF"), ("RPM", None), ("Vib (raw)", None)])
     >>> {channel: [column.unit for column in columns] for channel, columns in likely.items()}
     {'temperature': ['degF'], 'rotation_rate': ['RPM']}
+    >>> list(find_likely_channels([("Shock", "g RMS"), ("Sensor", "volts")]))
+    ['vibration']
     """
     likely: defaultdict[str, list[LikelyChannel]] = defaultdict(list)
     for place, (name, unit) in enumerate(columns):
         for channel, words in _WORDS.items():
-            has_word = re.search(words, f"{name} {unit or ''}".lower()) is not None
+            has_word = re.search(words, name.lower()) is not None or (
+                channel == "vibration" and _RMS_UNIT.search(unit or "") is not None
+            )
             if not has_word and (unit is None or channel not in _KNOWN_BY_UNIT):
                 continue
             column = _read_unit(place, name, unit, QUANTITIES[channel])
