@@ -26,7 +26,7 @@ _MAX_WIDTH = 1e6
 #: A design that keeps a smaller share of its square, after constants and given columns are
 #: projected out, counts as absent. Above rounding errors.
 _MIN_SQUARE_SHARE = 1e-9
-_FEW_COLUMNS = 8  # of which all products are computed at once
+_FEW_COLUMNS = 8  # whose products take less time than calls from Python
 _MAX_PRODUCTS_AT_ONCE = 100_000  # designs times records times grid points; limits memory
 
 
@@ -122,26 +122,12 @@ def mean_products(
     stacked = np.ascontiguousarray(np.concatenate([columns, values], axis=1))
     stacked[~present] = 0.0
     white_variance = np.where(present, variance, 1.0)
-    flicker = share, time, white = flicker_states(step, n * step)
     steps = np.full(n, step)
     if wander is None:
         wander = no_processes(n)
     if pairs is None and stacked.shape[1] <= _FEW_COLUMNS:
-        of_all, determinant = products_on_grid(
-            stacked,
-            white_variance,
-            steps,
-            present,
-            wander.walk,
-            K**2 / HOUR,
-            B**2,
-            flicker,
-            wander.square,
-            wander.time,
-            float(wander.angle),
-        )
-        square = np.diagonal(of_all, axis1=1, axis2=2)[:, width:]
-        return Products(square, of_all[:, :width, width:], of_all[:, :width, :width], determinant)
+        return _products_of_few(stacked, width, white_variance, steps, present, K, B, wander)
+    share, time, white = flicker_states(step, n * step)
     squares, times = np.append(share, wander.square), np.append(time, wander.time)
     shape = (K.size, values.shape[1])
     square, cross = np.empty(shape), np.empty((K.size, width, shape[1]))
@@ -167,6 +153,34 @@ def mean_products(
             products = row_products(np.ascontiguousarray(x.T), *pairs)
             gram[g][pairs] = gram[g][pairs[::-1]] = products
     return Products(square, cross, gram, determinant)
+
+
+def _products_of_few(
+    stacked: Floats,
+    width: int,
+    variance: Floats,
+    steps: Floats,
+    present: Bools,
+    K: Floats,
+    B: Floats,
+    wander: RandomProcesses,
+) -> Products:
+    """Compute all products of `width` columns and the block means after them, `stacked`."""
+    products, determinant = products_on_grid(
+        stacked,
+        variance,
+        steps,
+        present,
+        wander.walk,
+        K**2 / HOUR,
+        B**2,
+        flicker_states(steps[0], steps.size * steps[0]),
+        wander.square,
+        wander.time,
+        float(wander.angle),
+    )
+    square = np.diagonal(products, axis1=1, axis2=2)[:, width:]
+    return Products(square, products[:, :width, width:], products[:, :width, :width], determinant)
 
 
 def column_pairs(width: int, designs: Sequence[Ints], given: int) -> tuple[Ints, Ints]:

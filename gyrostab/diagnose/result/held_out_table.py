@@ -72,16 +72,7 @@ def measure_held_out(
     )
 
     settings = identifications.state.settings
-    calibrated: dict[bytes, xr.Dataset] = {}  # by the training blocks
-    responses = cache(partial(logger_responses, blocks))
-
-    def calibrate(training: Bools) -> xr.Dataset:
-        place = training.tobytes()
-        if place not in calibrated:
-            calibrated[place] = calibrate_on_training_blocks(
-                blocks, baseline, training, responses=responses, settings=settings
-            )
-        return calibrated[place]
+    calibrate = _make_calibration(blocks, baseline, settings)
 
     def before(training: Bools) -> xr.Dataset:
         return expected_baseline(with_course, calibrate(training), training)
@@ -112,6 +103,22 @@ def measure_held_out(
     if not has_forecast:
         evidence["forecast_gain"] = np.nan  # no effect can be forecast
     return evidence
+
+
+def _make_calibration(blocks: xr.Dataset, baseline: xr.Dataset, settings: Settings) -> FitBaseline:
+    """Return what calibrates the noise on training blocks, once on each set of them."""
+    calibrated: dict[bytes, xr.Dataset] = {}  # by the training blocks
+    responses = cache(partial(logger_responses, blocks))
+
+    def calibrate(training: Bools) -> xr.Dataset:
+        place = training.tobytes()
+        if place not in calibrated:
+            calibrated[place] = calibrate_on_training_blocks(
+                blocks, baseline, training, responses=responses, settings=settings
+            )
+        return calibrated[place]
+
+    return calibrate
 
 
 def _list_begun(
