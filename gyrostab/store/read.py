@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from gyrostab.arrays import Array, Ints
 from gyrostab.errors import DamageError, FormatError, reading_of
 from gyrostab.kernels.encoding.counts import from_counts
-from gyrostab.store.damage import check_blosc_chunks, check_codecs, check_global_heaps
+from gyrostab.store.damage import check_blosc_chunks, check_global_heaps, open_zarr
 from gyrostab.store.layout import ChunkCache, ChunkDamage, is_readable, read_chunk
 from gyrostab.store.lazy import FileVariable, RowSource, make_dask
 from gyrostab.store.private import close_function
@@ -79,8 +79,7 @@ def _open_remote(path: Path, url: str) -> xr.Dataset:
         raise FormatError(f"{url}: is not a Zarr store; copy the file here, and give the copy")
     with reaching(url), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # without consolidated metadata
-        stored = xr.open_dataset(url.rstrip("/"), engine="zarr", **_AS_STORED)
-        check_codecs(url, stored.variables)
+        stored = open_zarr(url.rstrip("/"), url, **_AS_STORED)
         return _make_variables_lazy(replace_stamps(stored, path), {}, path)
 
 
@@ -95,17 +94,20 @@ def _open_dataset(
             f"{path}: is a folder, not a Zarr store (neither zarr.json nor .zgroup is in it)"
             + (f"; name a file in it: {list_some(inside)}" if inside else "")
         )
-    engine: Any = "zarr" if path.is_dir() else "netcdf4"
     name = "Zarr" if path.is_dir() else "NetCDF"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # without consolidated metadata
-            stored = xr.open_dataset(path, engine=engine, **_AS_STORED)
+            if path.is_dir():
+                stored = open_zarr(str(path), str(path), **_AS_STORED)
+            else:
+                stored = xr.open_dataset(path, engine="netcdf4", **_AS_STORED)
+    except FormatError:
+        raise
     except Exception as error:  # the backends raise errors of many kinds on damaged files
         raise DamageError(
             f"{path}: is not {name}, or is damaged or cut short ({error}); make or copy it again"
         ) from error
-    check_codecs(str(path), stored.variables)
     if check is not None:
         check(path, stored.variables)
     is_log = stored.attrs.get("gyrostab_content") == "log"

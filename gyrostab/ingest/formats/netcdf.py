@@ -41,7 +41,7 @@ from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
 from gyrostab.store.attributes import read_attribute
 from gyrostab.store.cf import from_disk
-from gyrostab.store.damage import check_blosc_chunks, check_codecs, check_global_heaps
+from gyrostab.store.damage import check_blosc_chunks, check_global_heaps, open_zarr
 from gyrostab.store.read import open_stored
 from gyrostab.store.remote import find_url
 from gyrostab.store.times import decode_stamps
@@ -166,13 +166,14 @@ def _columns_of(variables: Mapping[str, xr.Variable], name: str, dim: Any) -> li
 @contextmanager
 def _open_undecoded(path: Path) -> Iterator[xr.Dataset]:
     """Open a file or store with xarray, which decodes neither numbers nor stamps."""
-    options: dict[str, Any] = {"engine": "netcdf4"}
-    if path.is_dir():
-        options = {"engine": "zarr", "consolidated": False}
+    options: dict[str, Any] = {
+        "chunks": None, "decode_cf": False, "create_default_indexes": False
+    }  # fmt: skip
     try:
-        stored = xr.open_dataset(
-            path, chunks=None, decode_cf=False, create_default_indexes=False, **options
-        )
+        if path.is_dir():
+            stored = open_zarr(str(path), path.name, consolidated=False, **options)
+        else:
+            stored = xr.open_dataset(path, engine="netcdf4", **options)
     except KeyError as error:
         if "dimension" not in str(error):
             raise
@@ -181,7 +182,6 @@ def _open_undecoded(path: Path) -> Iterator[xr.Dataset]:
             "_ARRAY_DIMENSIONS (Zarr format 2) or dimension_names (format 3)"
         ) from error
     with stored:
-        check_codecs(path.name, stored.variables)
         yield stored
 
 
