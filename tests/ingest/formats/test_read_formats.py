@@ -21,6 +21,7 @@ from gyrostab.errors import FormatError, MissingUnitError, OptionError, UnitErro
 from gyrostab.ingest import ReadOptions, read_log, readers, scan_file
 from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.columns.pieces import Buffers, Spool
+from gyrostab.io.datasets import has_zstd
 from gyrostab.schema import check_raw
 from tests.support.columns import write_columns
 
@@ -410,6 +411,7 @@ def test_groups_of_hdf5_with_other_rates_are_channels(tmp_path: Path) -> None:
     assert any("left out" in note and "odd.spare" in note for note in raw.attrs["notes"])
 
 
+@pytest.mark.skipif(not has_zstd(), reason="the NetCDF library has no zstd")
 def test_hdf5_with_a_filter_of_netcdf_is_read(tmp_path: Path) -> None:
     values = np.arange(500) / 100
     columns = {"time": (values, "s"), "gyro_x": (values, "deg/h")}
