@@ -68,25 +68,6 @@ def check_codecs(where: str, variables: Mapping[Any, Any]) -> None:
                 )
 
 
-def open_zarr(target: str, where: str, *, consolidated: bool | None = None, **options: Any) -> Any:
-    """Open a Zarr store with xarray, once its codecs are known to be harmless.
-
-    xarray may decode a variable while it opens a store. `where` names the store in messages, and
-    `options` are those of `xarray.open_dataset`.
-
-    Raises
-    ------
-    FormatError
-        See `check_codecs`.
-    """
-    import xarray as xr
-    from xarray.backends import ZarrStore
-
-    store = ZarrStore.open_group(target, mode="r", consolidated=consolidated)
-    check_codecs(where, store.get_variables())
-    return xr.open_dataset(store, engine="store", **options)
-
-
 def is_blosc_cut(header: bytes, size: int) -> bool:
     """Whether a Blosc chunk of `size` bytes is shorter than its header says.
 

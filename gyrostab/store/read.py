@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from xarray.backends import ZarrStore
 
 from gyrostab.arrays import Array, Ints
 from gyrostab.errors import DamageError, FormatError, reading_of
 from gyrostab.kernels.encoding.counts import from_counts
-from gyrostab.store.damage import check_blosc_chunks, check_global_heaps, open_zarr
+from gyrostab.store.damage import check_blosc_chunks, check_codecs, check_global_heaps
 from gyrostab.store.layout import ChunkCache, ChunkDamage, is_readable, read_chunk
 from gyrostab.store.lazy import FileVariable, RowSource, make_dask
 from gyrostab.store.private import close_function
@@ -81,6 +82,24 @@ def _open_remote(path: Path, url: str) -> xr.Dataset:
         warnings.simplefilter("ignore", RuntimeWarning)  # without consolidated metadata
         stored = open_zarr(url.rstrip("/"), url, **_AS_STORED)
         return _make_variables_lazy(replace_stamps(stored, path), {}, path)
+
+
+def open_zarr(
+    target: str, where: str, *, consolidated: bool | None = None, **options: Any
+) -> xr.Dataset:
+    """Open a Zarr store with xarray, once its codecs are known to be harmless.
+
+    xarray may decode a variable while it opens a store. `where` names the store in messages, and
+    `options` are those of `xarray.open_dataset`.
+
+    Raises
+    ------
+    FormatError
+        See `gyrostab.store.damage.check_codecs`.
+    """
+    store = ZarrStore.open_group(target, mode="r", consolidated=consolidated)
+    check_codecs(where, store.get_variables())
+    return xr.open_dataset(store, engine="store", **options)
 
 
 def _open_dataset(

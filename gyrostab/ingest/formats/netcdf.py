@@ -41,8 +41,8 @@ from gyrostab.ingest.uniform import as_uniform
 from gyrostab.schema import SIGNAL_UNITS, log_channels, signal_name
 from gyrostab.store.attributes import read_attribute
 from gyrostab.store.cf import from_disk
-from gyrostab.store.damage import check_blosc_chunks, check_global_heaps, open_zarr
-from gyrostab.store.read import open_stored
+from gyrostab.store.damage import check_blosc_chunks, check_global_heaps
+from gyrostab.store.read import open_stored, open_zarr
 from gyrostab.store.remote import find_url
 from gyrostab.store.times import decode_stamps
 
