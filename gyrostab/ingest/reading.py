@@ -82,7 +82,7 @@ def read_log(
     unit : mapping of str to str, optional
         Name -> unit: ``{"gyro": "deg/s"}`` (all gyro axes), ``{"gyro_x": ...}``, ``{"time":
         "us"}``; factors allowed (``"0.1 arcsec/s"``).
-    missing_value : float or sequence of float
+    missing_value : float or sequence of float, optional
         Numbers that mean a missing value in columns of the gyro and of channels, as they are
         written there: ``-999.25``.
     kind : {"rate", "angle"}, optional
@@ -276,8 +276,8 @@ def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Datas
     if options.rate is not None:
         check_same_rate(log, options.rate, name)
     idle = [
-        f"--{option}"
-        for option in ("start", "epoch", "map", "unit", "kind")
+        f"--{option.replace('_', '-')}"
+        for option in ("start", "epoch", "map", "unit", "missing_value", "kind")
         if getattr(options, option)
     ]
     if not idle or options.channel:

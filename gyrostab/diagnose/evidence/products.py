@@ -26,7 +26,7 @@ _MAX_WIDTH = 1e6
 #: A design that keeps a smaller share of its square, after constants and given columns are
 #: projected out, counts as absent. Above rounding errors.
 _MIN_SQUARE_SHARE = 1e-9
-_FEW_COLUMNS = 8  # whose products take less time than calls from Python
+_FEW_COLUMNS = 8  # of which all products are computed in one call; limits time alone
 _MAX_PRODUCTS_AT_ONCE = 100_000  # designs times records times grid points; limits memory
 
 

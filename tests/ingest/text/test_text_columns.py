@@ -13,6 +13,8 @@ from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, Option
 from gyrostab.ingest import read_log
 from gyrostab.ingest.columns.headers import FileColumn, distinct_columns
 from gyrostab.ingest.grid.regularise import regularise
+from gyrostab.ingest.make_log import make_log
+from gyrostab.io.datasets import to_netcdf
 from gyrostab.units import INNER
 from tests.support.text_logs import PLAIN, ns, write
 
@@ -598,3 +600,11 @@ def test_a_code_is_a_number(tmp_path: Path, code: object) -> None:
     path = write(tmp_path, "time [s],gyro_x [deg/s]\n0.0,1\n0.1,2\n")
     with pytest.raises(OptionError, match=r"missing-value .*: give a number such as"):
         read_log(path, missing_value=code)
+
+
+def test_a_declared_code_is_not_used_on_a_regular_log(tmp_path: Path) -> None:
+    """Its values are converted already, so that the number of the file is no longer there."""
+    path = to_netcdf(make_log(np.arange(200.0), rate=10.0, unit="deg/h"), tmp_path / "log.nc")
+    log = read_log(path, missing_value=5.0)
+    assert log["rate"].values[0, 5] == 5.0
+    assert any("so --missing-value is not used" in note for note in log.attrs["notes"])
