@@ -85,7 +85,9 @@ def guess_columns(
         guess.sampling_rate_hz = 1.0 / (guess.time.pace * unit_seconds(guess.time_unit))
     _guess_axes(inspection, guess)
     angles = kind == "angle" or any(
-        given_unit(column, "angle") or column.name.lower().startswith("angle_")
+        given_unit(column, "angle")
+        or _is_increment(column)
+        or column.name.lower().startswith("angle_")
         for column in guess.group
     )
     if not all(given_unit(column, "angle" if angles else "rate") for column in guess.group):
@@ -204,6 +206,13 @@ def _may_be_gyro(column: ColumnInspection) -> bool:
     )
 
 
+def _is_increment(column: ColumnInspection) -> bool:
+    """Return whether the name of a column is that of angle increments, and it has their unit."""
+    return bool(INCREMENT_PATTERN.search(column.key)) and (
+        given_unit(column, "angle") or find_unit_in_name(column.key, "angle") is not None
+    )
+
+
 def _group_columns(
     columns: Sequence[ColumnInspection],
 ) -> Iterator[tuple[str, dict[str, ColumnInspection]]]:
@@ -244,8 +253,8 @@ def _gyro_score(
 ) -> float:
     """Return a score of how much a group of columns looks like a gyro."""
     low = template.lower()
-    increments = INCREMENT_PATTERN.search(low) and all(given_unit(c, "angle") for c in group)
-    if increments or any(given_unit(column) for column in group):
+    has_unit = any(given_unit(column) for column in group)
+    if has_unit or all(map(_is_increment, group)):
         score = 4.0
     else:
         score = 2.5 * any(find_unit_in_name(column.key, "rate") for column in group)
@@ -262,7 +271,8 @@ def _gyro_score(
         score += 0.5 if max(scatters) < 30 * max(min(scatters), 1e-30) else -0.5
         norm = math.hypot(*(column.mean for column in group))
         if (
-            any(abs(norm / gravity - 1) < 0.05 for gravity in (9.80665, 1.0))
+            not has_unit
+            and any(abs(norm / gravity - 1) < 0.05 for gravity in (9.80665, 1.0))
             and _mean_over_scatter(group) > 10
         ):
             score -= 3.0  # an accelerometer at rest, in m/s^2 or g

@@ -123,12 +123,13 @@ def guess_unit(inspection: FileInspection, guess: Guess, *, angles: bool) -> Non
 
 def _guess_by_name(guess: Guess, *, angles: bool) -> bool:
     """Guess the unit by the headers of the columns; return whether one names it."""
+    quantity = "angle" if angles else "rate"
     for column in guess.group:
-        in_header = given_unit(column)
-        named = column.unit if in_header else find_unit_in_name(column.key, "rate")
+        in_header = given_unit(column, quantity)
+        named = column.unit if in_header else find_unit_in_name(column.key, quantity)
         if named is None and not angles and (angle := find_unit_in_name(column.key, "angle")):
             named = f"{angle}/s"
-        if named is not None and is_unit_of(named, ("rate",)):
+        if named is not None and is_unit_of(named, (quantity,)):
             by = "that of another axis" if in_header else "name"
             guess.reasons.append(f"unit {named}, by {by}")
             guess.unit = named

@@ -60,6 +60,8 @@ GX, GY, GZ = gyro_dps()
 AX, AY, AZ = accelerations()
 RADIANS = [values / DEG_PER_RAD for values in (GX, GY, GZ)]
 FINE = [values * 3600 for values in gyro_dps(fine=True)]
+#: Rates [deg/h] whose numbers are those of gravity in m/s^2.
+AS_GRAVITY = [0.2 * rate + bias for rate, bias in zip(FINE, (1.2, -0.95, 6.94), strict=True)]
 Columns = dict[str, Floats]
 
 
@@ -100,6 +102,12 @@ LOGS: dict[str, tuple[Columns, bool, Sequence[Floats], str]] = {
         "deg/s",
     ),
     "fine": (named("time,gx,gy,gz", [TIME, *FINE]), True, FINE, "deg/h"),
+    "as gravity": (
+        named("min,rate x [deg/h],rate y [deg/h],rate z [deg/h]", [TIME / 60, *AS_GRAVITY]),
+        True,
+        AS_GRAVITY,
+        "deg/h",
+    ),
     "no time": (named("gx_dps,gy_dps,gz_dps", [GX, GY, GZ]), True, [GX, GY, GZ], "deg/s"),
     "one axis": (named("time [s],temp,yaw_rate_deg_s", [TIME, 20 + TIME, GX]), True, [GX], "deg/s"),
     "two axes by number": (
@@ -239,13 +247,18 @@ def test_angles_get_a_kind_in_the_command_and_keep_their_unit(
     assert mean == pytest.approx(3600 * GX.mean(), abs=5 * 3600 * GX.std() / np.sqrt(ROWS))
 
 
-def test_angle_increments_are_the_gyro_by_name(tmp_path: Path, monkeypatch, capsys) -> None:
+@pytest.mark.parametrize("column", ["dtheta_x [arcsec]", "dtheta_x_arcsec"])
+def test_angle_increments_are_the_gyro_by_name(
+    tmp_path: Path, monkeypatch, capsys, column: str
+) -> None:
     monkeypatch.chdir(tmp_path)
-    columns = {"time [s]": TIME, "toolface [deg]": TIME % 360, "dtheta_x [arcsec]": GX * 36}
+    columns = {"time [s]": TIME, "toolface [deg]": TIME % 360, column: GX * 36}
     write(tmp_path / "log.csv", columns)
-    assert call("scan", "log.csv") == 0
-    words = next_command(capsys.readouterr().out)
-    assert {"dtheta_x=gyro_x", "rate"} <= set(words)
+    call("scan", "log.csv")
+    shown = capsys.readouterr()
+    words = next_command(shown.out + shown.err)
+    assert {f"{column.split()[0]}=gyro_x", "rate"} <= set(words)
+    assert "rad/s" not in shown.out
     assert call(*words, "--quiet-progress") == 0
     capsys.readouterr()
     with open_product("product.nc") as product:

@@ -337,6 +337,8 @@ def _axis_options(column: FileColumn) -> str:
     if column.unit and is_unit_of(column.unit, ("angle",)):
         return f" --kind {'rate' if INCREMENT_PATTERN.search(column.name) else 'angle'}"
     low = column.header.lower()
+    if INCREMENT_PATTERN.search(column.name):
+        return f" --unit gyro={'rad' if 'rad' in low else 'deg'} --kind rate"
     if re.search(r"deg_?(per_?|/)?h|dph", low):
         return " --unit gyro=deg/h"
     return f" --unit gyro={'rad/s' if 'rad' in low else 'deg/s'}"
