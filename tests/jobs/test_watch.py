@@ -439,14 +439,23 @@ def test_a_command_that_is_stopped_or_killed_is_continued(number, tmp_path):
     source, output = tmp_path / "log.csv", tmp_path / "live.zarr"
     source.write_text(HEADER + "".join(rows[:6_000]))
     options = [part for name, value in WINDOWS.items() for part in (f"--{name}", value)]
-    command = [sys.executable, "-m", "gyrostab", "watch", str(source), "-o", str(output), *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    command = ["watch", str(source), "-o", str(output), *options]
+    code = (
+        "import signal, sys\n"
+        # a job in the background starts with the signal ignored
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from gyrostab.cli import main\n"
+        "sys.exit(main())"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *command], stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout.readline().split()[0] == "1970-01-01T00:00:10"
         process.send_signal(number)
         process.communicate(timeout=60)
     assert process.returncode == (0 if number == signal.SIGINT else -number)
     source.write_text(HEADER + "".join(rows))
-    assert main([*command[3:], "--idle", "0.3s"]) == 0
+    assert main([*command, "--idle", "0.3s"]) == 0
     run([source], tmp_path / "run.nc", windows=WINDOWS)
     assert_same_product(output, tmp_path / "run.nc")
 
