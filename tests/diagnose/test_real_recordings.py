@@ -67,7 +67,7 @@ def test_turns_of_the_ramp_are_counted(open_recording: Callable[..., Any]) -> No
     assert -np.mean(turns) == pytest.approx(RESETS_PER_S, rel=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_no_resets_without_the_ramp_channel(open_recording: Callable[..., Any]) -> None:
     diagnosis = gyrostab.diagnose(open_recording("fog-blueseis-without-ramp", end=180.0), nulls=100)
     assert diagnosis.verdict != "no mismatch"

@@ -155,7 +155,7 @@ def _what_a_worker_knows():
     return list(sys.modules), threads
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_zarr_store_and_text_on_workers(address, tmp_path):
     small = _log().isel(time=slice(0, 30_000))
     store = to_zarr(small, tmp_path / "log.zarr")

@@ -453,7 +453,7 @@ def test_two_runs_of_one_output_at_once(log, tmp_path, capfd):
     ("calls", "kills"),
     [
         (2, 1),
-        pytest.param(4, 2, marks=pytest.mark.slow),
+        pytest.param(4, 2, marks=pytest.mark.full),
         pytest.param(16, 8, marks=pytest.mark.full),
     ],
 )

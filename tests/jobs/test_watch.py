@@ -480,7 +480,7 @@ for count in range(2, len(files) + 1, 4):
 """
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="is about the allocator of glibc")
 def test_memory_does_not_grow_with_the_files_that_were_read(tmp_path):
     rows = 40_000

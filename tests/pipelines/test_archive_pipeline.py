@@ -112,7 +112,7 @@ def test_a_damaged_file_is_left_out_and_named(archive):
         assert len(product.attrs["source_files"]) == 3
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_second_start_keeps_complete_results(archive):
     folder, _ = archive
     results = [folder / "results" / name for name in ("log.nc", "product.nc")]

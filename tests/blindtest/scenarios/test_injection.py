@@ -231,7 +231,7 @@ def test_an_injection_stays_on_the_grid_of_the_recording(effect: str) -> None:
     assert np.abs(values / step - np.rint(values / step)).max() < 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_truth_of_an_injection_has_the_axes_of_the_log() -> None:
     log = make_log(white(3)[:1], {}, start=0, rate=RATE).assign_coords(axis=["z"])
     copies = inject_effect(log, "vibration_rectification", 8.0, np.random.default_rng(4))

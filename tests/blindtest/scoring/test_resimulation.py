@@ -163,9 +163,7 @@ WRONG_MODELS: list[tuple[dict[str, Any], dict[str, Any]]] = [
     (JUMP, {"step": [0.1]}),
     (JUMP, {"at": 1200.0}),
     (EFFECTS[-1], {"kick": 30.0}),
-]
-#: Twice the size and the other sign, which are easier to see than half the size.
-EASIER_MODELS: list[tuple[dict[str, Any], dict[str, Any]]] = [
+    # twice the size and the other sign, which are easier to see than half the size
     *((EFFECTS[0], {"sensitivity": size}) for size in (0.006, -0.003)),
     *((EFFECTS[1], {"linear": size}) for size in (0.04, -0.02)),
     (EFFECTS[2], {"white": 0.004}),
@@ -179,10 +177,10 @@ EASIER_MODELS: list[tuple[dict[str, Any], dict[str, Any]]] = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("effect", "wrong"),
-    [*WRONG_MODELS, *(pytest.param(*pair, marks=pytest.mark.full) for pair in EASIER_MODELS)],
+    WRONG_MODELS,
     ids=lambda value: " ".join(str(value) for value in value.values()),
 )
 def test_wrong_model_loses_against_the_right_one(effect: dict[str, Any], wrong: dict[str, Any]):

@@ -60,14 +60,10 @@ def test_noise_shows_no_bias(noise):
     assert np.median(nats) < 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("rms", "time", "count"),
-    [
-        (0.3, 20.0, 5),
-        pytest.param(0.1, 30.0, 40, marks=pytest.mark.full),
-        pytest.param(0.15, 100.0, 40, marks=pytest.mark.full),
-    ],
+    [(0.3, 20.0, 5), (0.1, 30.0, 40), (0.15, 100.0, 40)],
 )
 def test_bias_is_found_with_its_size_and_time(rms, time, count):
     """The logarithms of both are within 3.5 standard errors, and the errors are of the right size.
@@ -92,7 +88,7 @@ def test_a_bias_in_the_model_is_no_evidence_of_another():
     assert found.nats < 3.0
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_bands_of_lines_are_no_evidence_of_a_bias():
     """The lines are in the model, with powers of their own sizes; means alone have angle noise."""
     log = simulate(_make_model({"N": 0.003}), duration="40min", rate=10.0, seed=3).sel(axis=["x"])

@@ -111,12 +111,12 @@ def test_null_records_have_the_peaks_of_the_model():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("seed", "inside", "known", "left"),
     [
-        pytest.param(2, SIZE, SIZE, 0.0, marks=pytest.mark.full),
-        pytest.param(3, SIZE, 0.0, SIZE, marks=pytest.mark.full),
+        (2, SIZE, SIZE, 0.0),
+        (3, SIZE, 0.0, SIZE),
         (4, 2 * SIZE, SIZE, 3**0.5 * SIZE),
     ],
 )

@@ -50,7 +50,7 @@ def test_a_model_expects_its_own_filter(filtering):
     assert np.abs(ratio - 1.0).max() < 5.0 / np.sqrt(2.0 * count)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("filtering", first_of({"cutoff": 2.0}, {"length": 0.5}), ids=str)
 def test_a_recording_does_not_differ_from_its_own_filter(filtering):
     model = made(**filtering)
@@ -75,7 +75,7 @@ def test_aliases_of_white_noise_are_not_taken_for_bias_instability():
     assert noise["B"] < 4.0 * NOISE["B"]  # 14 times, without aliases
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_named_filter_of_a_fast_instrument_simulates_the_recording():
     log = simulate(
         made("x", cutoff=6.0, order=4.0, oversampling=16), duration="30min", rate=10.0, seed=5

@@ -60,7 +60,7 @@ def test_a_jump_within_a_block_explains_its_power(jumped):
     } == {"bias_jump"}
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_jump_does_not_explain_noise_in_other_blocks(jumped):
     seconds = np.arange(jumped.sizes["time"]) / 10.0
     rate = jumped["rate"].transpose("axis", "time").values.copy()

@@ -74,7 +74,7 @@ def test_powers_of_a_simulation_are_the_expected_ones(effect):
     [
         pytest.param(WANDER_30_S, id="wander, 30 s"),
         pytest.param(WANDER_300_S, id="wander, 300 s", marks=pytest.mark.full),
-        pytest.param(SLOW_HOPS, id="hops, 200 s"),
+        pytest.param(SLOW_HOPS, id="hops, 200 s", marks=pytest.mark.full),
         pytest.param(FAST_HOPS, id="hops, 45 s", marks=pytest.mark.full),
     ],
 )

@@ -98,7 +98,7 @@ def test_stuck_samples_are_identified(table, options):
         assert fitted.effect.width == pytest.approx(table["width"], rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_periodic_pulse_is_lines_and_not_spikes():
     noise = SCATTER * np.random.default_rng(6).standard_normal((2, 15_000))
     noise[0, ::37] += 8.0 * SCATTER
@@ -153,7 +153,7 @@ def test_zero_filled_samples_are_identified_when_an_axis_is_lost():
     assert float(blocks["filled"].sel(axis="x").sum()) == pytest.approx(120, abs=25)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_axis_lost_early_keeps_blocks_with_anomalous_samples():
     """z has 20 of 92 blocks, with zeros in each: without them nothing would be left of it."""
     rng = np.random.default_rng(104)
@@ -200,7 +200,7 @@ def test_number_and_length_of_held_samples_are_estimated(fill, axes):
             assert fitted.parameters[name].low < true < fitted.parameters[name].high
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_held_samples_of_independent_axes_are_separate_effects():
     """Axes x and y repeat their samples together; z repeats its own at other instants."""
     rng = np.random.default_rng(9)
@@ -373,7 +373,7 @@ def test_burst_of_bit_errors_has_the_size_of_its_power():
     assert 0.5 < fitted.parameters["size"].value / np.sqrt(np.mean(flips**2)) < 2.0
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_noise_rising_within_a_block_has_no_outliers():
     rng = np.random.default_rng(6)
     shaken = (np.arange(15_000) >= 31 * 162 + 120) & (
@@ -463,7 +463,7 @@ def test_spikes_in_most_blocks_keep_their_size_and_power():
         assert before == pytest.approx(1.0, rel=0.4) if known else before < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_bursts_shorter_than_a_block_have_no_spikes():
     rng = np.random.default_rng(9)
     loud = np.ones(15_000)

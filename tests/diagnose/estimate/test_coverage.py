@@ -60,7 +60,7 @@ def median_half_width(estimates: list[dict[str, Any]], name: str) -> float:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_intervals_of_a_slow_curved_supply_response():
     time, size = 45.0, 0.12
     second = np.arange(SECONDS)
@@ -117,7 +117,7 @@ def test_intervals_of_a_dead_band_between_grid_values(size):
     assert median_half_width(estimates, "sensitivity") < 0.4 * size
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_limit_of_an_effect_slower_than_the_grid():
     size, time = 0.25, 700.0
     heat = np.interp(np.arange(SECONDS), *np.transpose(HEAT))

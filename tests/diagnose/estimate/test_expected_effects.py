@@ -52,7 +52,7 @@ def diagnose_against_model(effects, *, environment=(), more=(), axes="xyz", seed
 @pytest.mark.parametrize(
     ("effects", "environment", "axes"),
     [
-        ([SPIKES, MEMORY, WALK], (SHAKE,), "xyz"),
+        pytest.param([SPIKES, MEMORY, WALK], (SHAKE,), "xyz", marks=pytest.mark.full),
         pytest.param([HELD], (), "xy", marks=pytest.mark.full),
         pytest.param([SWAY], (), "xy", marks=pytest.mark.full),
         ([EARTH, SCALE], (TURN,), "yz"),
@@ -64,7 +64,7 @@ def test_effects_of_the_model_are_not_mismatches(effects, environment, axes):
     assert diagnosis.verdict == "no mismatch", (diagnosis.effects, diagnosis.content["mismatches"])
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_effect_in_addition_to_expected_ones_is_identified():
     diagnosis = diagnose_against_model([SPIKES, MEMORY], more=[JUMP], axes="xy")
     assert [effect["name"] for effect in diagnosis.effects] == ["bias_jump"]

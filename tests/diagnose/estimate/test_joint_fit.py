@@ -78,14 +78,10 @@ def coverage(estimates, truth: float) -> float:
     return float(np.mean([estimate.low <= truth <= estimate.high for estimate in estimates]))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("size", "power"),
-    [
-        pytest.param(0.1, 2.0, marks=pytest.mark.slow),
-        (0.5, 2.0),
-        pytest.param(0.5, 1.9, marks=pytest.mark.slow),
-    ],
+    [(0.1, 2.0), (0.5, 2.0), (0.5, 1.9)],
 )
 def test_intervals_of_rectification_hold_the_true_value(noise_only, size, power):
     g = noise_only[0]["channel_vibration"].values
@@ -105,7 +101,7 @@ def test_intervals_of_rectification_hold_the_true_value(noise_only, size, power)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("share", [0.2, pytest.param(1.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("share", [0.2, pytest.param(1.0, marks=pytest.mark.full)])
 def test_intervals_of_vibration_noise_hold_the_true_value(noise_only, share):
     g = noise_only[0]["channel_vibration"].values
     truth = 0.003 * np.sqrt(share) / 6.0

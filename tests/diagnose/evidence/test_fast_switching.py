@@ -157,11 +157,8 @@ def test_switching_powers_match_those_of_the_samples() -> None:
     assert np.corrcoef(np.log(predicted[:, 1] + 1e-3), np.log(recorded[:, 1] + 1e-3))[0, 1] > 0.99
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("low", "high", "deviations"),
-    [(30.0, 3.0, 12.0), pytest.param(4.0, 4.0, 3.0, marks=pytest.mark.full)],
-)
+@pytest.mark.full
+@pytest.mark.parametrize(("low", "high", "deviations"), [(30.0, 3.0, 12.0), (4.0, 4.0, 3.0)])
 def test_diagnosis_names_the_telegraph_with_its_parameters(
     low: float, high: float, deviations: float
 ) -> None:

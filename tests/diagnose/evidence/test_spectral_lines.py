@@ -142,7 +142,7 @@ def test_each_line_is_a_separate_identification(lines: tuple[Selection, ...]) ->
     )  # three lines may be a comb
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_evidence_is_recalled_only_where_nothing_has_changed() -> None:
     blocks = sines({3.4: 0.4}, size=6_000, axes=2)
     start, folds = initial_state(blocks, calibrate_noise(blocks)), fold_blocks(blocks)
@@ -186,7 +186,7 @@ def test_evidence_is_recalled_only_where_nothing_has_changed() -> None:
     assert all(0 < added[name] < first for name in states if name != "another line in its band")
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_more_lines_than_are_named_do_not_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(forward_search, "MAX_LINES", 1)
     blocks = sines({0.7: 0.3, 2.03: 0.25}, size=6_000, axes=1, jump=0.25)

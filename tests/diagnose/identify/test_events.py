@@ -63,7 +63,7 @@ def components_of(state: State, tried: Candidate) -> list[Component]:
     return find_components([tried], state)[tried.key]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("inside", first_of(slice(0, 3), slice(-4, None)))
 def test_temporary_noise_is_not_ageing(inside: slice) -> None:
     factor = np.ones(BLOCKS)
@@ -78,11 +78,8 @@ def test_temporary_noise_is_not_ageing(inside: slice) -> None:
     assert abs(end - range(BLOCKS)[inside][-1] - 1) <= 1
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("first", "last", "named"),
-    [(1.3, 1.0, []), pytest.param(1.0, 1.3, ["ageing_noise"], marks=pytest.mark.full)],
-)
+@pytest.mark.full
+@pytest.mark.parametrize(("first", "last", "named"), [(1.3, 1.0, []), (1.0, 1.3, ["ageing_noise"])])
 def test_ageing_noise_only_grows(first: float, last: float, named: list[str]) -> None:
     blocks = reduce_rates(noise_with_levels(np.sqrt(np.linspace(first**2, last**2, BLOCKS))))
     identifications = name_effects(blocks, *nulls(blocks, 40))
@@ -271,7 +268,7 @@ def test_scores_at_orders_scatter_like_null_records() -> None:
     assert float(real["z"].max()) < 2.0 * float(largest.max())
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_line_of_another_axis_is_named_beside_resets_of_the_ramp():
     """The resets explain lines near multiples of the ramp frequency on their own axis only."""
     phase = np.mod(0.72 * SECOND, 1.0)

@@ -74,7 +74,7 @@ def test_null_records_may_come_in_parts():
     assert_allclose(best_in_parts, best, rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_evidence_does_not_depend_on_the_parts_of_a_group(shaken, monkeypatch):
     state = shaken.state
     candidates = [item for item in shaken.candidates if item.statistic.null_variable]
@@ -315,7 +315,7 @@ def test_lost_blocks_are_expected_to_have_no_counts():
     assert many.min() > 40.0
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_every_line_of_a_comb_is_identified():
     """There are more lines than the limit for other effects."""
     quiet = reduce_log(
@@ -369,7 +369,7 @@ def test_sizes_of_infinite_error_may_have_any_value() -> None:
     assert distance_to_range(sizes, half_known, -limit, limit) == pytest.approx(0.0, abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("effect", ["temperature_bias", "thermal_hysteresis"])
 def test_a_lag_of_the_temperature_sensor_is_no_other_effect(effect):
     """The sensor of a tool that heats and cools at 2 degC/min lags by 20 s."""

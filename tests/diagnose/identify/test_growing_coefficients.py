@@ -249,7 +249,7 @@ def test_common_noise_of_the_model_is_not_a_mismatch(noisy_log) -> None:
     assert after < 8.0
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_anomalous_samples_count_in_the_held_out_evidence() -> None:
     model = {
         "log": {"axes": ["x"]},

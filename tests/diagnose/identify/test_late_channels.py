@@ -72,11 +72,8 @@ def examined(log: xr.Dataset) -> tuple[Identifications, xr.Dataset, xr.Dataset]:
     return identify_effects(prepare_examination(blocks, baseline, records)), baseline, log
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("delay", "own_stamps"),
-    [(DELAY, False), pytest.param(-123.0, True, marks=pytest.mark.full)],
-)
+@pytest.mark.full
+@pytest.mark.parametrize(("delay", "own_stamps"), [(DELAY, False), (-123.0, True)])
 def test_late_or_early_channel_is_found(delay: float, own_stamps: bool) -> None:
     record = examined(recorded([RECTIFIED], delay, own_stamps=own_stamps))
     found = find_late_channel(*record)
@@ -86,13 +83,13 @@ def test_late_or_early_channel_is_found(delay: float, own_stamps: bool) -> None:
     assert find_late_channel(*record, moved=["vibration"]) is None
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("effects", "delay", "world"),
     [
-        pytest.param([], DELAY, (SHAKEN,), marks=pytest.mark.full),
+        ([], DELAY, (SHAKEN,)),
         ([RECTIFIED], 0.0, (SHAKEN,)),
-        pytest.param([RECTIFIED], 400.0, (SHAKEN,), marks=pytest.mark.full),
+        ([RECTIFIED], 400.0, (SHAKEN,)),
         # the bias follows no channel
         ([{"name": "bias_jump", "axes": ["x"], "step": [0.2], "at": 450.0}], DELAY, (SHAKEN,)),
         ([{"name": "ageing_bias", "axes": ["x"], "slope": 20.0}], DELAY, (WARMING, SHAKEN)),

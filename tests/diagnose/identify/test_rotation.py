@@ -149,7 +149,7 @@ def test_tails_of_blocks_in_which_an_axis_turns_do_not_count():
     assert evidence[1] < 3.0
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_axis_that_turns_without_a_channel_leaks_into_another():
     """What nothing explains on the axis that turns does not hide the misalignment of another."""
     log = simulate(

@@ -72,7 +72,7 @@ def test_unrelated_channel_fails():
     assert p_value > 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_an_unrelated_channel_is_no_better_than_its_surrogates(monkeypatch):
     """An unrelated channel explains as much as half of its surrogates, whatever time constants are
     tried."""

@@ -388,7 +388,7 @@ def test_page_escapes_names(tmp_path: Path):
     assert "<script>alert" not in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("axes", ["x", pytest.param("xyz", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("axes", ["x", pytest.param("xyz", marks=pytest.mark.full)])
 def test_page_has_all_figures_for_any_number_of_axes(tmp_path: Path, axes: str):
     table = content()
     table["recording"]["axes"] = list(axes)

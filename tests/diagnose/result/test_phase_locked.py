@@ -80,7 +80,7 @@ def test_evidence_of_a_rotation_line_follows_the_normal_law() -> None:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_allan_variance_is_compared_with_the_complete_model() -> None:
     """The model for the likelihood lacks the phase-locked power, and would fit no better than
     before."""

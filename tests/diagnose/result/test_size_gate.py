@@ -260,7 +260,7 @@ def test_limit_of_a_mixture_lies_between_its_laws(laws):
     assert ends.min() * (1.0 - 1e-9) <= limit <= ends.max() * (1.0 + 1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("points", "has_forecast"),
     [
@@ -328,7 +328,7 @@ def test_noise_that_is_over_does_not_spoil_the_forecast_of_another_effect():
     assert held["forecast_gain"] > 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_bench_rotation_is_not_explained_by_a_failed_forecast(
     recordings: Callable[[str], Path],
 ):

@@ -40,7 +40,7 @@ def shaken_blocks(seed: int, *, band_hz: tuple[float, float] | None) -> xr.Datas
     return reduce_log(log, block="20s")
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("seed", first_of(1, 2, 3))
 @pytest.mark.parametrize("band_hz", [None, (600.0, 725.0)])
 def test_only_known_frequencies_of_aliased_vibration_are_stated(

@@ -74,15 +74,10 @@ def test_evidence_over_error_does_not_depend_on_the_unit_of_a_course(unit):
     assert scaled == pytest.approx(plain, abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("way", "size", "jump"),
-    [
-        (0.0, 0.4, True),
-        (100.0, 0.8, False),
-        pytest.param(0.0, 4.0, True, marks=pytest.mark.full),
-        pytest.param(160.0, 4.0, False, marks=pytest.mark.full),
-    ],
+    [(0.0, 0.4, True), (100.0, 0.8, False), (0.0, 4.0, True), (160.0, 4.0, False)],
 )
 def test_gradual_change_is_not_a_jump(way: float, size: float, jump: bool) -> None:
     second = np.arange(18_000) / 10.0
@@ -100,7 +95,7 @@ def test_gradual_change_is_not_a_jump(way: float, size: float, jump: bool) -> No
     assert bool(keep_physical(components, state)[0]) == jump
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_an_instant_that_axes_share_is_searched_once() -> None:
     """A jump that is weak on each of six axes is no scatter of their means."""
     axes = list("uvwxyz")

@@ -49,7 +49,7 @@ def place(jitter, scatter, losses, unit, *, rate=100.0, rows=20_000, seed=0, **o
         pytest.param("uniform", 0.6, "bursts", "ms", marks=pytest.mark.full),
         ("sorted", 0.6, "single", "us"),
         # less of both is in `test_jitter_at_random_in_every_way`
-        pytest.param("latest", 0.5, "bursts", "us", marks=pytest.mark.slow),
+        pytest.param("latest", 0.5, "bursts", "us", marks=pytest.mark.full),
         pytest.param("packets", 0.3, "none", "us", marks=pytest.mark.full),
         pytest.param("packets", 0.1, "bursts", "us", marks=pytest.mark.full),
         pytest.param("packets", 0.3, "single", "ms", marks=pytest.mark.full),
