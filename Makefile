@@ -19,18 +19,23 @@ PYTEST := -m pytest -n auto --dist loadfile --no-loadscope-reorder
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' Makefile | sed 's/:.*## /\t/' | expand -t 18
 
-$(VENV)/.installed: pyproject.toml
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -e .
+# Modules are compiled when they are first imported, as most of an installation is never used.
+PIP := $(BIN)/pip install --quiet --disable-pip-version-check --no-compile
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed: pyproject.toml | $(BIN)/python
+	$(PIP) -e .
 	touch $@
 
-$(VENV)/.installed-test: $(VENV)/.installed
-	$(BIN)/pip install --quiet --disable-pip-version-check -e ".[test]"
-	touch $@
+$(VENV)/.installed-test: pyproject.toml | $(BIN)/python
+	$(PIP) -e ".[test]"
+	touch $(VENV)/.installed $@
 
-$(VENV)/.installed-lint: $(VENV)/.installed-test
-	$(BIN)/pip install --quiet --disable-pip-version-check -e ".[test,lint]"
-	touch $@
+$(VENV)/.installed-lint: pyproject.toml | $(BIN)/python
+	$(PIP) -e ".[test,lint]"
+	touch $(VENV)/.installed $(VENV)/.installed-test $@
 
 demo: $(VENV)/.installed  ## install, and run the main job on the shipped log, a simulated day
 	$(BIN)/gyrostab demo -o $(OUT) --overwrite
@@ -59,9 +64,10 @@ test-minimum: $(VENV)-minimum/.installed  ## the tests with the lowest versions 
 fuzz: $(VENV)/.installed-test  ## try damaged inputs and write docs/fuzzing.md (N=100000 SEED=1 JOBS=2); can be stopped and repeated
 	$(BIN)/python -W ignore -m tests.fuzz --count $(N) --seed $(SEED) --jobs $(JOBS) --output docs/fuzzing.md
 
-$(VENV)/.installed-docs: $(VENV)/.installed
-	$(BIN)/pip install --quiet --disable-pip-version-check -e ".[docs]"
-	touch $@
+# With the tools of the tests, so that a machine that builds and tests installs once.
+$(VENV)/.installed-docs: pyproject.toml | $(BIN)/python
+	$(PIP) -e ".[test,docs]"
+	touch $(VENV)/.installed $(VENV)/.installed-test $@
 
 docs: $(VENV)/.installed-docs  ## build the site in docs/_build/html, with executed tutorials: stops at a cell that fails
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html

@@ -389,7 +389,7 @@ def test_counterparts_count_as_noise_and_in_no_other_figure(small, tmp_path, mon
         gyrostab.prove(tmp_path / "proof", counterparts=4, resume=True)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_run_of_an_earlier_version_is_scored_again(finished, small, tmp_path):
     before, _, _ = finished
     folder = shutil.copytree(before, tmp_path / "proof")

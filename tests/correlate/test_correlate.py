@@ -724,7 +724,7 @@ def test_command_writes_legal_units_and_a_figure(stored, tmp_path, capsys):
     assert_follows_cf(target)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_pipeline_joins_another_teams_file(stored, tmp_path):
     plan = tomllib.loads(
         (ROOT / "pipelines" / "temperature_chain.toml").read_text(encoding="utf-8")

@@ -95,7 +95,7 @@ def test_platform_sway_is_real_motion(open_recording: Callable[..., Any]) -> Non
     assert not {"dead_zone", "held_samples", "clipping"} & set(named_effects(diagnosis))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_fiber_optic_axis_does_not_follow_temperature(open_recording: Callable[..., Any]) -> None:
     diagnosis = gyrostab.diagnose(open_recording("fog-hybrid-warmup"), nulls=100)
     thermal = [effect for effect in diagnosis.effects if "temperature" in (effect["driver"] or "")]

@@ -60,6 +60,7 @@ def formula_log(formula: str) -> xr.Dataset:
     return log
 
 
+@pytest.mark.full
 def test_figures_show_names_and_units_as_they_are(tmp_path):
     formula = FORMULA
     log = formula_log(formula)

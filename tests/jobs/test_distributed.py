@@ -130,6 +130,7 @@ def whole(log, tmp_path_factory) -> bytes:
     return path.read_bytes()
 
 
+@pytest.mark.full
 def test_two_worker_processes_make_the_same_bytes(address, log, whole, tmp_path):
     run([log], tmp_path / "product.nc", windows=WINDOW, scheduler=address)
     assert (tmp_path / "product.nc").read_bytes() == whole

@@ -609,7 +609,7 @@ def test_a_fleet_is_written_to_an_object_store(archive, done, memory, tmp_path, 
     assert [path.name for path in tmp_path.iterdir()] == ["tool.csv"]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_fleet_at_an_address_is_brought_up_to_date(memory, tmp_path, computed, monkeypatch):
     monkeypatch.chdir(tmp_path)
     own, output, table = tmp_path / "in", "memory://results/fleet.zarr", "memory://rig/all.parquet"

@@ -139,6 +139,7 @@ def test_coefficients_are_estimates_or_limits_on_one_time_axis():
     assert {trace.get("xaxis", "x") for trace in figure["data"]} == {"x"}
 
 
+@pytest.mark.full
 def test_a_long_product_is_thinned_and_says_so(tmp_path):
     product = synthetic.product(windows=2500)
     charts = {chart.name: chart for chart in product_charts(product)}

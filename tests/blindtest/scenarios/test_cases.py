@@ -368,6 +368,7 @@ def test_composition_of_a_benchmark():
     assert plan_case(17, seed=5) == plans[17]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name", ["temperature_bias", "shupe", "thermal_hysteresis", "gauss_markov", "spectral_line"]
 )
@@ -386,6 +387,7 @@ def test_strength_in_fitted_noise_is_reached(name):
         assert strong.strength < 3.1
 
 
+@pytest.mark.full
 def test_a_third_of_the_forms_differ_from_those_fitted():
     scenario = replace(white_scenario(seconds=600), cuts=np.array([[200.0, 220.0]]))
     scenario = replace(scenario, light=np.linspace(1.0, 0.9, scenario.temperature.size))

@@ -59,7 +59,7 @@ def test_a_recording_does_not_differ_from_its_own_filter(filtering):
     assert diagnosis.verdict == "no mismatch"
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_aliases_of_white_noise_are_not_taken_for_bias_instability():
     log = simulate(
         made("x", cutoff=58.0, order=1.0, pick=1.0, oversampling=16),

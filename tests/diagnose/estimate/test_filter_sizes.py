@@ -16,6 +16,7 @@ from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.ingest.make_log import make_log
 
 
+@pytest.mark.full
 def test_undetermined_cutoff_has_a_wide_interval() -> None:
     """Samples with a little memory are a picked low-pass beyond half the rate; with free
     quantization noise, one at a low cutoff does the same."""

@@ -226,7 +226,7 @@ def test_effect_without_its_channel_is_not_identified():
     assert all(unidentified.axes == ("x",) for unidentified in identifications.unidentified)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_two_effects_are_both_identified():
     identifications = identify(
         [*VIBRATION, {"name": "vibration_rectification", "sensitivity": 0.006, "axes": ["y"]}],

@@ -166,7 +166,7 @@ def test_late_channel_explains_more_than_all_else(
     assert find_late_channel(identifications, blocks, blocks) is None
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_diagnosis_states_the_delay_and_its_model_has_it() -> None:
     log = recorded([RECTIFIED])
     found = diagnose(log, nulls=100)

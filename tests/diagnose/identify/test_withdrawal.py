@@ -150,7 +150,7 @@ def test_noisy_axes_are_not_correlated() -> None:
     assert {selection.effect for selection in chosen} <= {"~N(t)", "~burst"}
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_an_axis_that_turns_without_a_channel_has_no_jump_and_no_ageing():
     turned = [0, 300, 900, 500, 1200, 800, 1100, 950, 1190, 700, 1000, 400, 0]  # deg/h, not logged
     noise = 0.5 * np.random.default_rng(1).standard_normal((1, 3600))

@@ -108,6 +108,7 @@ def test_statistics_match_those_of_raw_logs(lost):
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("lost", first_of(0.3, 0.0))
 def test_covariance_of_neighbouring_bands_matches_raw_logs(lost):
     shares = []

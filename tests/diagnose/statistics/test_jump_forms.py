@@ -261,7 +261,7 @@ def test_jumps_at_all_restarts_are_sized(seed: int) -> None:
             assert estimate["stderr"] < 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("seed", first_of(2, 3))
 def test_two_jumps_beat_a_course_of_levels(seed: int) -> None:
     steps = levels((2.6, -2.1), (9500.0, 11_800.0), 14_400.0)[None]

@@ -188,6 +188,7 @@ def test_detection_limit_of_shared_noise(base, null):
     assert below < 0.5 < above
 
 
+@pytest.mark.full
 def test_detection_limit_of_a_line(base, null):
     def line(blocks, amplitude):
         signal, rng = amplitude**2 / 4.0 * 0.926 * BLOCK_S, np.random.default_rng(2)

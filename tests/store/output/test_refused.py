@@ -221,6 +221,7 @@ def test_a_written_dataset_of_xarray_is_an_input_while_it_is_lazy(tmp_path):
 # folders of files
 
 
+@pytest.mark.full
 def test_the_other_files_of_a_folder_of_figures_stay(folder, monkeypatch):
     monkeypatch.setattr(
         "gyrostab.plot.figures.save_png", lambda figure, path, dpi: save_png(figure, path, dpi=40)
