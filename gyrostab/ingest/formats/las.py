@@ -21,7 +21,14 @@ from gyrostab.ingest.columns.headers import is_time_unit
 from gyrostab.ingest.columns.stamps import NAT, floats_to_ns, parse_time_unit, texts_to_ns
 from gyrostab.ingest.columns.typed import holds_dates
 from gyrostab.ingest.formats.recognise import read_head
-from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
+from gyrostab.ingest.formats.tables import (
+    Table,
+    TableColumn,
+    TablesOfFile,
+    first_texts,
+    library,
+    make_reader,
+)
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.time.stamps import to_nanoseconds
 
@@ -54,10 +61,12 @@ def _read_curves(path: Path, options: ReadOptions) -> TablesOfFile:
             ("" if any(curve is clock for clock in clocks) else str(curve.mnemonic),),
             np.asarray(curve.data),
             None if holds_dates(curve.data) else curve.unit,
+            cells=first_texts(curve.data),
         )
         for curve in curves
     ]
-    return [Table(rows, columns, None if dates is None else TableColumn(("time",), dates))], ()
+    stamps = None if dates is None else TableColumn(("time",), dates, cells=first_texts(dates))
+    return [Table(rows, columns, stamps)], ()
 
 
 def _find_clock(

@@ -35,6 +35,7 @@ from gyrostab.store.private import library_lock
 
 #: Most columns of an array of two dimensions that is read as a table of sensors.
 MAX_COLUMNS = 64
+_HEAD_ROWS = 50  # whose texts show the time zone
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,8 @@ class TableColumn:
     #: Type and CF attributes of stored numbers, which are packed.
     dtype: Any = None
     attributes: Mapping[str, Any] | None = None
+    #: The first values as text, of times that may be local, or where there may be a time zone.
+    cells: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "unit", str(self.unit or "").strip() or None)
@@ -56,6 +59,13 @@ class TableColumn:
         """Return the values of rows."""
         is_function = callable(self.values)
         return self.values(start, stop) if is_function else np.asarray(self.values[start:stop])
+
+
+def first_texts(values: Any) -> list[str]:
+    """Return the first values as text, none of numbers."""
+    first = np.asarray(values[:_HEAD_ROWS])
+    texts = [] if first.dtype.kind in "biuf" else first.astype(str).tolist()
+    return ["" if text == "NaT" else text for text in texts]
 
 
 class StoredArray:
@@ -274,7 +284,9 @@ def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _
 
 def _describe_column(column: TableColumn, name: str, *, stamped: bool = False) -> FileColumn:
     calendar = attribute_text((column.attributes or {}).get("calendar")) or None
-    return FileColumn(name, column.unit, calendar, stamped=stamped, target=column.target)
+    return FileColumn(
+        name, column.unit, calendar, stamped=stamped, target=column.target, cells=column.cells
+    )
 
 
 def _add_clock(plan: Plan, source: int, described: Sequence[FileColumn], *, is_named: bool) -> None:

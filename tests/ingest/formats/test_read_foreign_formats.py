@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from gyrostab.errors import FormatError, MissingUnitError
+from gyrostab.errors import FormatError, MissingUnitError, UnitError
 from gyrostab.ingest import read_log, scan_file
 from tests.ingest.field_files import las_text, write_trace
 
@@ -126,6 +126,23 @@ def test_units_of_las_give_digits_of_dates_and_times(
 ) -> None:
     raw = read_log(write_las(tmp_path / "a.las", date, clock, [row] * 2))
     assert raw.time.values[0] == np.datetime64(first)
+
+
+@pytest.mark.parametrize(
+    ("curves", "row"),
+    [
+        ("DATE. TIME. TZ. GYRO_X.deg/h", "14-Mar-26 08:00:00 +02:00 1.5"),
+        ("TIME. TZ. GYRO_X.deg/h", "2026-03-14T08:00:00 CEST 1.5"),
+    ],
+)
+def test_zone_of_a_las_file_is_asked_for(tmp_path: Path, curves: str, row: str) -> None:
+    path = tmp_path / "a.las"
+    path.write_text(las_text(curves, [row] * 2))
+    with pytest.raises(UnitError, match=r"column 'TZ' holds .*--unit time=UTC"):
+        read_log(path)
+    for offset, first in (("UTC", "08:00"), ("UTC+02:00", "06:00")):
+        raw = read_log(path, unit={"time": offset})
+        assert raw.time.values[0] == np.datetime64(f"2026-03-14T{first}")
 
 
 def test_las_without_rows_is_refused(tmp_path: Path) -> None:
