@@ -60,7 +60,7 @@ def simulate_axes(seed: int, *names: str):
     return simulate(model, duration="25min", rate=10.0, seed=seed).compute()
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("seed", first_of(11, 12))
 def test_steady_effects_of_the_simulation_are_not_mismatches(seed):
     names = ("shared_source", "line", "bump")

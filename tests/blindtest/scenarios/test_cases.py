@@ -217,7 +217,7 @@ def test_size_of_a_random_bias_matches_its_spectrum():
     assert nats < more
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_sub_threshold_cases_are_invisible_in_trace_and_allan_plot():
     plan = small("spectral_line", kind="sub_threshold", seconds=3600, heavy=False, strength=1.5)
     log, truth = make_case(plan)
@@ -441,7 +441,7 @@ def test_unknown_effect_is_refused():
         make_case(small("shupe") | {"names": ["gremlin"]})
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_baseline_detectors_see_strong_effects_only():
     log, truth = make_case(small("vibration_noise", strength=120.0, seconds=1800))
     assert allan_detector(log.rate.values, truth, rng=np.random.default_rng(0), nulls=30) > 0.0

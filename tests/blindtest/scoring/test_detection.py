@@ -124,7 +124,7 @@ def score_record(record: np.ndarray, temperature: np.ndarray) -> float:
     return stepwise_detector(log)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_stepwise_regression_allows_for_random_walk():
     scores = [score_record(*noise_log(seed)) for seed in range(12)]
     assert sum(score > 0.0 for score in scores) <= 2

@@ -110,7 +110,7 @@ def noise_alone() -> xr.Dataset:
     return recording_of()
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
     "effect", EFFECTS, ids=lambda effect: f"{effect['name']} {effect.get('fill', '')}".strip()
 )

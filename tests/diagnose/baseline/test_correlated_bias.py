@@ -44,13 +44,13 @@ def _find_on_x(model: dict, seed: int, duration: str = "1h") -> CorrelatedBias:
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
     "noise",
     [
-        pytest.param({"N": 0.003}, marks=pytest.mark.slow, id="white"),
+        pytest.param({"N": 0.003}, id="white"),
         pytest.param({"N": 0.003, "B": 0.1, "K": 1.0, "Q": 0.3}, id="strong"),
-        pytest.param({"N": 0.003, "K": 1000.0}, marks=pytest.mark.slow, id="far above white noise"),
+        pytest.param({"N": 0.003, "K": 1000.0}, id="far above white noise"),
     ],
 )
 def test_noise_shows_no_bias(noise):

@@ -100,8 +100,8 @@ def test_intervals_of_rectification_hold_the_true_value(noise_only, size, power)
     )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("share", [0.2, pytest.param(1.0, marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("share", [0.2, 1.0])
 def test_intervals_of_vibration_noise_hold_the_true_value(noise_only, share):
     g = noise_only[0]["channel_vibration"].values
     truth = 0.003 * np.sqrt(share) / 6.0

@@ -392,8 +392,8 @@ def test_anomalous_samples_do_not_raise_the_noise(size):
     assert error < 0.05 * value
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("lost", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
+@pytest.mark.full
+@pytest.mark.parametrize("lost", [0.0, 0.3])
 @pytest.mark.parametrize(
     ("table", "grid"),
     [
@@ -401,11 +401,7 @@ def test_anomalous_samples_do_not_raise_the_noise(size):
             {"cutoff": 2.0, "order": 2},
             {"cutoff": 2.0, "order": 2.0, "instrument": 1.0, "pick": 0.0, "length": 0.0},
         ),
-        pytest.param(
-            {"length": 0.5},
-            {"length": 0.5, "instrument": 1.0, "cutoff": 0.0},
-            marks=pytest.mark.full,
-        ),
+        ({"length": 0.5}, {"length": 0.5, "instrument": 1.0, "cutoff": 0.0}),
     ],
 )
 def test_noise_before_a_filter_is_recovered(table, grid, lost):

@@ -53,7 +53,7 @@ def shaken():
     return identify(VIBRATION)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_noise_has_no_identification():
     identifications = identify([], axes="xy", seed=2)
     assert identifications.identified == identifications.unidentified == ()

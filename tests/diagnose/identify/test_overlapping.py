@@ -74,7 +74,7 @@ def test_identification_keeps_axes_that_still_show_it():
         assert repr(with_axes_of(identification, others)) == repr(identification)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_two_opposite_jumps_have_evidence_only_together():
     jumps = [
         {"name": "bias_jump", "step": [step], "at": at, "axes": ["x"]}

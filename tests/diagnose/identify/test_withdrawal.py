@@ -104,7 +104,7 @@ def test_masked_blocks_do_not_count() -> None:
     assert measure_fluctuation(replace(state, masked=(burst > 1.0)[None]), "x") < 2.0
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_smooth_effect_that_stands_for_bursts_is_withdrawn() -> None:
     level = np.ones(BLOCKS)
     rng = np.random.default_rng(4)
