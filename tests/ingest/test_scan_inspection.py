@@ -258,7 +258,7 @@ def test_angle_increments_are_the_gyro_by_name(
     shown = capsys.readouterr()
     words = next_command(shown.out + shown.err)
     assert {f"{column.split()[0]}=gyro_x", "rate"} <= set(words)
-    assert "rad/s" not in shown.out
+    assert "deg/s" not in shown.out
     assert call(*words, "--quiet-progress") == 0
     capsys.readouterr()
     with open_product("product.nc") as product:
