@@ -35,7 +35,6 @@ from gyrostab.store.private import library_lock
 
 #: Most columns of an array of two dimensions that is read as a table of sensors.
 MAX_COLUMNS = 64
-_HEAD_ROWS = 50  # whose texts show the time zone
 
 
 @dataclass(frozen=True)
@@ -59,13 +58,6 @@ class TableColumn:
         """Return the values of rows."""
         is_function = callable(self.values)
         return self.values(start, stop) if is_function else np.asarray(self.values[start:stop])
-
-
-def first_texts(values: Any) -> list[str]:
-    """Return the first values as text, none of numbers."""
-    first = np.asarray(values[:_HEAD_ROWS])
-    texts = [] if first.dtype.kind in "biuf" else first.astype(str).tolist()
-    return ["" if text == "NaT" else text for text in texts]
 
 
 class StoredArray:

@@ -26,7 +26,7 @@ def log() -> xr.Dataset:
     return made.assign(gap_cause=made["gap_cause"] * 0)
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_model_of_a_warm_up_restarts_after_the_gaps_of_the_record(log):
     diagnosis = diagnose(log, nulls=100)
     assert {effect["name"] for effect in diagnosis.effects} == {"warm_up"}
