@@ -11,7 +11,7 @@ from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.noise import TERMS
 
-RATE, BLOCK_S, PARTS = 100.0, 20.0, 8
+RATE, BLOCK_S, PARTS = 100.0, 20.0, 16
 
 
 def frame(

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Array, Floats
-from gyrostab.diagnose.evidence.spectral_lines import expected_lines
+from gyrostab.diagnose.evidence.spectral_lines import expected_lines, merge_parts
 from gyrostab.diagnose.predict.filter_response import filter_factors
 from gyrostab.diagnose.predict.linear_model import (
     average_in_bands,
@@ -174,8 +174,8 @@ def remove_known_lines(
 ) -> xr.Dataset:
     """Subtract the known steady lines from the line spectrum and from the sines.
 
-    The excess over a known line stays if it exceeds the model error of an effect and the scatter of
-    the noise.
+    The excess over a known line stays in the parts of the record, as `spectral_line` divides it,
+    where it exceeds the model error of an effect and the scatter of the noise.
     """
     if "lines" not in baseline:
         return blocks
@@ -184,15 +184,19 @@ def remove_known_lines(
     without_gaps = [baseline[name].values for name in ("lines", "lines_most")]
     share = unspread_share_of_lines(blocks)[:, None]
     known_power, largest_power = ((share * lines)[:, None] for lines in without_gaps)
+    used_weight = np.broadcast_to(np.nan_to_num(weight.values)[..., None], power.shape)
+    merged_weight = merge_parts(used_weight)
     with np.errstate(divide="ignore", invalid="ignore"):
-        scatter = np.sqrt((noise**2 + 2.0 * noise * largest_power) / weight.values[..., None])
+        scatter = np.sqrt((noise**2 + 2.0 * noise * largest_power) / merged_weight)
+        mean_power = merge_parts(np.nan_to_num(power.values) * used_weight) / merged_weight
     above = power.values - noise - known_power
     error = settings.spectrum_error_share
     exceeds = (
-        power.values - noise - largest_power
+        mean_power - noise - largest_power
         > error * largest_power + settings.known_line_sigma * scatter
     )
     exceeds = _take_leakage(exceeds).any(axis=-1)
+    exceeds = np.repeat(exceeds, power.sizes["part"] // exceeds.shape[-2], axis=-2)
     freed = noise + np.where(exceeds | (largest_power < error * noise), above, 0.0)
     freed = np.where(known_power > 0.0, np.maximum(freed, 0.0), power.values)
     square, stderr = (blocks[f"sine_square{end}"].values for end in ("", "_stderr"))

@@ -11,6 +11,8 @@ from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import EDGE_LINES, LEAK_LINES, level_around, local_level
 
+#: Parts of a record in which a steady line is judged. Design choice.
+JUDGED_PARTS = 8
 _MIN_LEVEL_RATIO = 1e-3  # of the spectrum, that known lines leave; design choice
 _MAX_SKIRT_LINES = 40  # design choice
 _POWERS_AT_ONCE = 100_000  # of null records; so many fit in the cache of a processor
@@ -33,6 +35,20 @@ def interpolate_bands(values: Array, frequency: Array, bands: Array) -> Array:
     """Interpolate positive values (axis, band) at frequencies (axis, line), as powers of both."""
     places, centres = np.log(frequency), np.log(bands)
     return np.stack([np.exp(np.interp(places, centres, np.log(row))) for row in values])
+
+
+def merge_parts(sums: Array) -> Array:
+    """Add up sums (..., part, line) of the parts of a record to those in `JUDGED_PARTS` parts.
+
+    Examples
+    --------
+    >>> merge_parts(np.ones((16, 3))).shape
+    (8, 3)
+    """
+    *leading, parts, lines = sums.shape
+    return np.asarray(
+        sums.reshape(*leading, JUDGED_PARTS, parts // JUDGED_PARTS, lines).sum(axis=-2)
+    )
 
 
 def line_evidence(power: Array, weight: Array, expected: Array | None = None) -> Array:

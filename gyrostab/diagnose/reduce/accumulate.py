@@ -25,9 +25,9 @@ from gyrostab.kernels.samples.outliers import HISTOGRAM
 from gyrostab.kernels.spectra import periodogram as kernel
 from gyrostab.time.grid import first_stamp
 
-#: Parts of the record, each with its own line spectrum. Design choice: eight show whether a line
-#: persists or drifts.
-RECORD_PARTS = 8
+#: Parts of the record, each with its own line spectrum, in which a line persists or drifts. The
+#: score of a drifting line grows with the root of their number, the time with the number.
+RECORD_PARTS = 16
 #: Bins of the ramp phase. Design choice.
 RAMP_PHASE_BINS = 40
 #: Parts of a block over which lagged channels are averaged. Design choice.

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from scipy.special import log_ndtr
 
-from gyrostab.arrays import Floats
+from gyrostab.arrays import Floats, Ints
 from gyrostab.diagnose.evidence.spectral_lines import expected_lines
 from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.diagnose.statistics.mismatch_wording import axes_text
@@ -17,17 +17,19 @@ from gyrostab.diagnose.statistics.scores import (
     SINE_TAU_CYCLES,
     BlockWindows,
     cube_root_score,
-    cumulative,
     exponential_score,
     part_windows,
     statistic_dataset,
 )
 from gyrostab.kernels.spectra.line_levels import local_level
+from gyrostab.kernels.spectra.line_paths import largest_path_sums
 
 _SPECTRUM_SECTIONS = 8  # in which paths begin and end; design choice
 _MIN_PARTS = 6  # of the record, that a path must cover; design choice
 _MIN_MOVED_LINES = 4  # of a drifting line; design choice
-_BENDS = (-0.7, 0.0, 0.7)  # of a path, as a share of its length: accelerating, steady, slowing
+#: Bends of a path, as a share of its length, from accelerating to slowing down. Derived: a path
+#: between two of them is within 4 % of its length, and a part of the record has 6 %.
+_BENDS = (-0.7, -0.35, 0.0, 0.35, 0.7)
 #: Largest contribution of a line of one part, and of a part: a drifting line is in all parts.
 _MAX_CELL_SIGMA, _MAX_PART_SIGMA = 4.0, 3.0
 _MAX_LINES = 250  # more are averaged in groups; limits time
@@ -78,13 +80,15 @@ class DriftingLine(Statistic):
         # Axes with common noise add up to more.
         cells = cells / np.maximum(cells.std(axis=(-2, -1), keepdims=True), 1.0)
         edges = np.stack([parts, parts + 1]) - parts[0]
-        largest, path_count = _largest_path_sums(cells, edges / edges.max())
+        paths = _list_paths(cells.shape[-1], edges / edges.max())
+        path_count = paths.count_by_column(cells.shape[-1])
+        largest = _largest_path_sums(cells, paths)
         with np.errstate(divide="ignore", invalid="ignore"):
             # Expected number of paths of noise with this score.
             expected_count = np.exp(np.log(_INDEPENDENT_SHARE * path_count) + log_ndtr(-largest))
             p_value = -np.expm1(-np.minimum(expected_count, _MAX_EXPECTED_PATHS))
             z = np.where(path_count > 0, exponential_score(-np.log(p_value)), np.nan)
-        first, stop = part_windows(blocks)
+        first, stop = part_windows(blocks, blocks.sizes["part"])
         return statistic_dataset(
             blocks,
             rows=axes,
@@ -134,45 +138,56 @@ def _score_cells(power: Floats, weight: Floats, expected: Floats) -> Floats:
     )
 
 
-def _path_shapes(lines: int) -> Iterator[tuple[int, float]]:
-    """Yield the lines that a path moves by, and its bend."""
-    move = _MIN_MOVED_LINES
-    while move < lines:
-        yield from ((sign * move, bend) for sign in (1, -1) for bend in _BENDS)
-        move += max(1, move // _SPECTRUM_SECTIONS)
+class _Paths(NamedTuple):
+    """Paths of all shapes, by shape; `gyrostab.kernels.spectra.line_paths` has the meanings."""
+
+    low: Ints  # (shape, part)
+    high: Ints
+    first: Ints  # (shape,)
+    stop: Ints
+    step: Ints
+    move: Ints
+
+    def count_by_column(self, lines: int) -> Floats:
+        """Return the number of paths between each two sections, (column,)."""
+        out = np.zeros(_SPECTRUM_SECTIONS**2)
+        for first, stop, step, move in zip(*self[2:], strict=True):
+            start = np.arange(first, stop, step)
+            begin, end = (place * _SPECTRUM_SECTIONS // lines for place in (start, start + move))
+            np.add.at(out, begin * _SPECTRUM_SECTIONS + end, 1.0)
+        return out
 
 
-def _largest_path_sums(cells: Floats, edges: Floats) -> tuple[Floats, Floats]:
-    """Find the largest sum along paths between sections by (record), row, column; count paths.
+def _list_paths(lines: int, edges: Floats) -> _Paths:
+    """List the paths through `lines` lines; `edges` (2, part) are begin and end of each part."""
+    moves, size = [], _MIN_MOVED_LINES
+    while size < lines:
+        moves += [size, -size]
+        size += max(1, size // _SPECTRUM_SECTIONS)
+    move = np.repeat(moves, len(_BENDS))
+    bend = np.tile(_BENDS, len(moves))
+    along = edges + bend[:, None, None] * edges * (1.0 - edges)
+    shift = np.rint(move[:, None, None] * along).astype(np.int64)
+    return _Paths(
+        shift.min(axis=1),
+        shift.max(axis=1) + 1,
+        np.maximum(0, -move),
+        lines - np.maximum(0, move),
+        np.maximum(1, np.abs(move) // (2 * edges.shape[1])),
+        move,
+    )
 
-    `cells` are (record), row, part, line [standard deviations], `edges` (2, part) the begin and end
-    of each part, 0 to 1.
+
+def _largest_path_sums(cells: Floats, paths: _Paths) -> Floats:
+    """Find the largest sum along paths between sections by (record), row, column.
+
+    `cells` are (record), row, part, line [standard deviations].
     """
-    lines, parts = cells.shape[-1], cells.shape[-2]
-    total = cumulative(cells)
-    largest = np.full((*cells.shape[:-2], _SPECTRUM_SECTIONS**2), -np.inf)
-    path_count = np.zeros(_SPECTRUM_SECTIONS**2)
-    for move, bend in _path_shapes(lines):
-        shift = np.rint(move * (edges + bend * edges * (1.0 - edges))).astype(np.int64)
-        low, high = shift.min(axis=0), shift.max(axis=0) + 1
-        begin, end, step = max(0, -move), lines - max(0, move), max(1, abs(move) // (2 * parts))
-        start = np.arange(begin, end, step)
-        sums = np.zeros((*cells.shape[:-2], start.size))
-        for part in range(parts):
-            upper, lower = (
-                slice(begin + edge, end + edge, step) for edge in (high[part], low[part])
-            )
-            inside = total[..., part, upper] - total[..., part, lower]
-            sums += np.minimum(inside / np.sqrt(high[part] - low[part]), _MAX_PART_SIGMA)
-        column = (
-            start * _SPECTRUM_SECTIONS // lines * _SPECTRUM_SECTIONS
-            + (start + move) * _SPECTRUM_SECTIONS // lines
-        )
-        first = np.flatnonzero(np.diff(column, prepend=-1))
-        best = np.maximum.reduceat(sums / np.sqrt(parts), first, axis=-1)
-        largest[..., column[first]] = np.maximum(largest[..., column[first]], best)
-        np.add.at(path_count, column, 1.0)
-    return largest, path_count
+    series = np.ascontiguousarray(cells.reshape(-1, *cells.shape[-2:]))
+    largest = largest_path_sums(series, *paths, _SPECTRUM_SECTIONS, _MAX_PART_SIGMA)
+    return np.asarray(
+        largest.reshape(*cells.shape[:-2], _SPECTRUM_SECTIONS**2) / np.sqrt(cells.shape[-2])
+    )
 
 
 def _path_columns(frequency: Floats) -> dict[str, Any]:

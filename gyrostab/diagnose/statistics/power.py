@@ -35,7 +35,6 @@ from gyrostab.diagnose.predict.linear_model import (
 )
 from gyrostab.diagnose.predict.sizes import component_mixture, component_size, disagreement_nats
 from gyrostab.diagnose.predict.windows import hat_functions
-from gyrostab.diagnose.reduce.accumulate import RECORD_PARTS
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.base import Competitor, Statistic, choose_columns
@@ -46,6 +45,7 @@ from gyrostab.physics.registry import effects
 
 #: Columns of the score that show another level of the noise.
 LEVEL_COLUMNS = ("avar", "level")
+_PARTS = 8  # of a record in which a steady effect has one size; design choice
 _MAX_INTERVALS = 240  # intervals of a burst that are tried; limits time
 
 
@@ -238,7 +238,7 @@ def parts_of_record(component: Component, state: State) -> Iterator[Competitor]:
     size, error = np.array(
         [
             _fit_part(component, state, inside)
-            for inside in np.array_split(np.arange(state.blocks.sizes["block"]), RECORD_PARTS)
+            for inside in np.array_split(np.arange(state.blocks.sizes["block"]), _PARTS)
         ]
     ).T
     weight = np.where(np.isfinite(size) & np.isfinite(error) & (error > 0.0), error, np.inf) ** -2.0

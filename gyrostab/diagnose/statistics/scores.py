@@ -59,9 +59,9 @@ def window_set(block_count: int, lengths: Sequence[int], *, whole: bool = True) 
     return BlockWindows(begin, begin + np.concatenate(length))
 
 
-def part_windows(blocks: xr.Dataset) -> BlockWindows:
+def part_windows(blocks: xr.Dataset, part_count: int) -> BlockWindows:
     """Return the blocks of the equal parts of the record, and of the whole last."""
-    part_count, block_count = blocks.sizes["part"], blocks.sizes["block"]
+    block_count = blocks.sizes["block"]
     # As the blocks were divided when the log was read.
     edge = -(-np.arange(part_count + 1) * block_count // part_count)
     return BlockWindows(

@@ -11,10 +11,12 @@ import xarray as xr
 
 from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.evidence.spectral_lines import (
+    JUDGED_PARTS,
     expected_lines,
     line_evidence,
     line_skirt,
     mean_line_power,
+    merge_parts,
 )
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
@@ -74,12 +76,13 @@ class SpectralLineStatistic(Statistic):
         """
         power, weight = blocks["line_power"].values, blocks["line_weight"].values
         frequency = blocks["line_frequency"].values
-        windows = part_windows(blocks)
+        windows = part_windows(blocks, JUDGED_PARTS)
         expected = expected_lines(baseline, frequency)[:, None, :]
         flat = power / expected
         present = np.isfinite(flat) & (weight > 0)[..., None]
         used_weight = np.where(present, weight[..., None], 0.0)
-        flat = np.where(present, flat, 0.0) * used_weight
+        flat = merge_parts(np.where(present, flat, 0.0) * used_weight)
+        used_weight = merge_parts(used_weight)
         with np.errstate(divide="ignore", invalid="ignore"):
             record_sum = flat.sum(axis=-2, keepdims=True)
             count = np.concatenate([used_weight, used_weight.sum(axis=-2, keepdims=True)], axis=-2)

@@ -12,7 +12,7 @@ import gyrostab
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.baseline.from_simulation import baseline_from_simulation
 from gyrostab.diagnose.baseline.known_lines import _line_leakage, remove_known_lines
-from gyrostab.diagnose.evidence.spectral_lines import expected_lines, line_evidence
+from gyrostab.diagnose.evidence.spectral_lines import JUDGED_PARTS, expected_lines, line_evidence
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.statistics import find_statistic
@@ -74,6 +74,31 @@ def test_only_a_line_well_above_the_model_is_reported(lost):
     baseline = baseline_from_model(reduce_log(log_of(1, SIZE, lost)), model(SIZE))
     assert left(1.03) < 6.0
     assert left(1.5) > 20.0
+
+
+def test_more_power_than_that_of_a_known_line_is_judged_in_the_parts_of_a_steady_line():
+    blocks = reduce_log(log_of(1, SIZE))
+    baseline = baseline_from_model(blocks, model(SIZE))
+    frequency = blocks["line_frequency"].values
+    line = int(np.argmin(np.abs(frequency - PLACE)))
+    noise = float(expected_lines(baseline, frequency)[0, line])
+    most = float(baseline["lines_most"][0, line])
+    assert blocks.sizes["part"] == 2 * JUDGED_PARTS
+    weight = float(blocks["line_weight"][0].mean())
+    # six standard errors above what is known, of one part of the spectrum
+    excess = 0.1 * most + 6.0 * np.sqrt((noise**2 + 2.0 * noise * most) / weight)
+
+    def left(parts: slice) -> np.ndarray:
+        power = blocks["line_power"].copy(deep=True)
+        power[0, :, line] = noise + most
+        power[0, parts, line] += excess
+        return remove_known_lines(blocks.assign(line_power=power), baseline)["line_power"][
+            0, :, line
+        ]
+
+    assert float(left(slice(4, 5)).max()) == pytest.approx(noise)
+    both = left(slice(4, 6))
+    assert np.flatnonzero(both > 1.01 * noise).tolist() == [4, 5]
 
 
 @pytest.mark.parametrize("sampling", ["point", "average"])

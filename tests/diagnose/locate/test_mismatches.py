@@ -156,7 +156,7 @@ def test_wandering_mean_is_one_mismatch(base, null):
     )
     assert region["sign"] == 0
     assert region["end"] - region["begin"] > 3000.0
-    assert abs(region["estimate"]) == pytest.approx(0.4, abs=0.15)
+    assert 0.3 < abs(region["estimate"]) < 0.6  # between the mean of half a wave and its crest
 
 
 def test_pieces_of_one_region_are_merged_and_others_are_not():

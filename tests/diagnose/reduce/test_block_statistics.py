@@ -192,17 +192,17 @@ def test_a_sine_is_in_its_band_and_line():
         2.0, rel=0.1
     )  # power 2**2 / 2, with the error of the taper
     lines = blocks.line_power.values[0]
-    assert lines.shape[0] == 8
+    assert lines.shape[0] == 16
     assert np.all(blocks.line_frequency.values[np.argmax(lines, axis=1)] == 13.0)
 
 
-def test_line_spectra_average_the_blocks_of_an_eighth():
+def test_line_spectra_average_the_blocks_of_a_sixteenth():
     rng = np.random.default_rng(3)
     blocks = reduce_log(log_of(rng.standard_normal(240_000)), block="5s")  # 480 blocks
-    assert blocks.line_weight.values == pytest.approx(60.0, rel=0.01)
+    assert blocks.line_weight.values == pytest.approx(30.0, rel=0.01)
     lines = blocks.line_power.values * RATE
     assert lines.mean() == pytest.approx(1.0, abs=0.02)
-    assert lines.var() * 60.0 == pytest.approx(1.0, abs=0.15)
+    assert lines.var() * 30.0 == pytest.approx(1.0, abs=0.15)
 
 
 @pytest.mark.parametrize("gaps", ["none", "random"])

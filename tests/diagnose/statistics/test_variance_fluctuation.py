@@ -17,7 +17,7 @@ from gyrostab.diagnose.result.text import mismatch_statement
 from gyrostab.diagnose.statistics import find_statistic, variance_fluctuation
 from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.spectra.periodogram import taper
-from tests.support.reduced_records import baseline, chunks, records
+from tests.support.reduced_records import PARTS, baseline, chunks, records
 
 SMALL = {"rate": 10.0, "block_count": 120}
 BLOCKS, LINES = 120, 100
@@ -176,16 +176,15 @@ def _moving_line(blocks, row, first, last, energy, bend=0.0):
     """Add a line of this power over the density, moving between two lines from block to block."""
     rng = np.random.default_rng(3)
     level = float(blocks["line_power"].mean())
-    for component in range(8):
-        for block in range(BLOCKS // 8):
-            t = (component + (block + 0.5) / (BLOCKS // 8)) / 8.0
-            line = round(first + (last - first) * (t + bend * t * (1.0 - t)))
-            beat = (
-                2.0 * np.sqrt(energy) * rng.normal(0.0, np.sqrt(0.5), blocks.sizes["record"])
-            )  # of the line with the noise
-            blocks["line_power"].values[:, row, component, line] += (
-                level * (energy + beat) / (BLOCKS // 8)
-            )
+    part_of = np.arange(BLOCKS) * PARTS // BLOCKS
+    for block, part in enumerate(part_of):
+        t = (block + 0.5) / BLOCKS
+        line = round(first + (last - first) * (t + bend * t * (1.0 - t)))
+        # of the line with the noise
+        beat = 2.0 * np.sqrt(energy) * rng.normal(0.0, np.sqrt(0.5), blocks.sizes["record"])
+        blocks["line_power"].values[:, row, part, line] += (
+            level * (energy + beat) / (part_of == part).sum()
+        )
 
 
 @pytest.mark.parametrize(
@@ -193,7 +192,9 @@ def _moving_line(blocks, row, first, last, energy, bend=0.0):
 )
 def test_a_drifting_line_is_detected_along_its_path(base, null, first, last, bend):
     blocks = _some_records(base, 12, 12)
-    energy = 9.0 * np.sqrt(abs(last - first) / (8.0 * BLOCKS))  # nine standard deviations in theory
+    energy = 9.0 * np.sqrt(
+        abs(last - first) / (PARTS * BLOCKS)
+    )  # nine standard deviations in theory
     _moving_line(blocks, 1, first, last, energy, bend)
     critical = null.critical("drifting_line", 0.01)
     assert (
@@ -217,8 +218,8 @@ def test_a_drifting_line_is_detected_along_its_path(base, null, first, last, ben
 def test_a_steady_line_and_a_temporary_hump_do_not_drift(base, null):
     blocks = _some_records(base, 20, 13)
     blocks["line_power"][:, 0, :, 37] *= 50.0
-    blocks["line_power"][:, 1, 3, 20:60] *= 3.0
-    blocks["line_power"][:, 2, 2:6] *= 4.0
+    blocks["line_power"][:, 1, 6:8, 20:60] *= 3.0
+    blocks["line_power"][:, 2, 4:12] *= 4.0
     assert (
         _largest_score(find_statistic("drifting_line"), blocks, base, null)
         > null.critical("drifting_line", 0.01)
