@@ -35,3 +35,15 @@ def test_penalty_is_the_sum_of_squared_differences():
     D = np.diff(np.eye(30), 2, axis=0)
     expected = np.linalg.solve(np.eye(30) + 0.7**4 * D.T @ D, values)
     np.testing.assert_allclose(smooth_curve(values, longest=0.7), expected, atol=1e-10)
+
+
+def test_the_rate_of_change_is_never_much_noisier_than_usual():
+    """Smoothing too little now and then would spoil the rate of change first."""
+    t = np.arange(0.0, 1000.0, 5.0)
+    since = np.clip(t - 300.0, 0.0, None)
+    true = (since - 60.0 * -np.expm1(-since / 60.0)) / 60.0  # a ramp that begins with a lag
+    errors = []
+    for seed in range(60):
+        noisy = true + 0.016 * np.random.default_rng(seed).standard_normal(t.size)
+        errors.append(np.std(np.diff(smooth_curve(noisy, longest=8.0) - true)) / 0.016)
+    assert max(errors) < 1.5 * np.median(errors)
