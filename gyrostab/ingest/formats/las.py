@@ -21,13 +21,19 @@ from gyrostab.ingest.columns.headers import is_time_unit
 from gyrostab.ingest.columns.stamps import NAT, floats_to_ns, parse_time_unit, texts_to_ns
 from gyrostab.ingest.columns.typed import holds_dates
 from gyrostab.ingest.formats.recognise import read_head
-from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, library, make_reader
+from gyrostab.ingest.formats.tables import (
+    Table,
+    TableColumn,
+    TablesOfFile,
+    first_texts,
+    library,
+    make_reader,
+)
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.time.stamps import to_nanoseconds
 
 # Date fields in units of curves -> codes of `datetime.strptime`.
 _DATE_CODES = {"yyyy": "%Y", "yy": "%y", "mmm": "%b", "mm": "%m", "dd": "%d"}
-_HEAD_ROWS = 50  # whose texts show the time zone
 #: The line of a header that lets commas separate values; lasio takes them for decimal points.
 _COMMAS = re.compile(rb"(?im)^\s*DLM\s*\.\s*COMMA")
 #: A cell with a date and a time of day, such as ``14-Mar-26/08:00:00.5``.
@@ -55,19 +61,12 @@ def _read_curves(path: Path, options: ReadOptions) -> TablesOfFile:
             ("" if any(curve is clock for clock in clocks) else str(curve.mnemonic),),
             np.asarray(curve.data),
             None if holds_dates(curve.data) else curve.unit,
-            cells=_first_texts(curve.data),
+            cells=first_texts(curve.data),
         )
         for curve in curves
     ]
-    stamps = None if dates is None else TableColumn(("time",), dates, cells=_first_texts(dates))
+    stamps = None if dates is None else TableColumn(("time",), dates, cells=first_texts(dates))
     return [Table(rows, columns, stamps)], ()
-
-
-def _first_texts(values: Any) -> list[str]:
-    """Return the first values as text, none of numbers."""
-    first = np.asarray(values[:_HEAD_ROWS])
-    texts = [] if first.dtype.kind in "biuf" else first.astype(str).tolist()
-    return ["" if text == "NaT" else text for text in texts]
 
 
 def _find_clock(

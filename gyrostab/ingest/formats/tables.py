@@ -35,6 +35,7 @@ from gyrostab.store.private import library_lock
 
 #: Most columns of an array of two dimensions that is read as a table of sensors.
 MAX_COLUMNS = 64
+_HEAD_ROWS = 50  # whose texts show the time zone
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,13 @@ class TableColumn:
         """Return the values of rows."""
         is_function = callable(self.values)
         return self.values(start, stop) if is_function else np.asarray(self.values[start:stop])
+
+
+def first_texts(values: Any) -> list[str]:
+    """Return the first values as text, none of numbers."""
+    first = np.asarray(values[:_HEAD_ROWS])
+    texts = [] if first.dtype.kind in "biuf" else first.astype(str).tolist()
+    return ["" if text == "NaT" else text for text in texts]
 
 
 class StoredArray:
@@ -142,11 +150,15 @@ class Messages:
         self.stamps.append(stamp if abs(stamp) < 2**63 else NAT)
 
     def make_table(
-        self, *group: str, time_unit: str | None = None, targets: Mapping[str, str] | None = None
+        self,
+        *group: str,
+        time_unit: str | None = None,
+        targets: Mapping[str, str] | None = None,
+        may_be_local: bool = False,
     ) -> Table:
         """Return the columns with the names of their group, and targets of fields as of ``--map``.
 
-        Without `time_unit` the stamps are nanoseconds since 1970.
+        Without `time_unit` the stamps are nanoseconds since 1970, in UTC or in local time.
         """
         for column in self.columns.values():
             self._fill_column(column)
@@ -156,7 +168,8 @@ class Messages:
             for name, column in self.columns.items()
         ]
         clock = stamps if time_unit else stamps.view("datetime64[ns]")
-        return Table(len(stamps), columns, TableColumn(("time",), clock, time_unit))
+        cells = first_texts(clock) if may_be_local else ()
+        return Table(len(stamps), columns, TableColumn(("time",), clock, time_unit, cells=cells))
 
     def _fill_column(self, column: array[float]) -> None:
         if len(column) < len(self.stamps):
@@ -283,11 +296,11 @@ def _describe_column(column: TableColumn, name: str, *, stamped: bool = False) -
 
 def _add_clock(plan: Plan, source: int, described: Sequence[FileColumn], *, is_named: bool) -> None:
     """Plan the stamps of a table, as planned if both clocks are stored in one unit."""
-    own, time = described[source], plan.time
+    own, time = replace(described[source], header="", cells=()), plan.time
     if (time is None and is_named) or any(column.source == source for column in plan.of("time")):
         return  # the user leaves out the stamps, or they are planned
-    planned = Column(source, own.header, "time", "time", "ns")
-    if time is not None and replace(described[time.source], header="") == replace(own, header=""):
+    planned = Column(source, described[source].header, "time", "time", "ns")
+    if time is not None and replace(described[time.source], header="", cells=()) == own:
         planned = replace(time, source=source)
     elif own.stored is not None:
         try:

@@ -1,8 +1,8 @@
 """WITS level 0 (text): the items of each record type by their four digits, such as ``0921``.
 
 A frame begins with ``&&`` and ends with ``!!``; each line in between is a record type, an item and
-its value. Items 05 and 06 of every record are the date (YYMMDD) and the time (HHMMSS). The stream
-contains no units: give name and unit as in ``--map "0921=temperature [degC]"``.
+its value. Items 05 and 06 of every record are the date (YYMMDD) and the time (HHMMSS), UTC or
+local. The stream contains no units: give name and unit as in ``--map "0921=temperature [degC]"``.
 
 References
 ----------
@@ -42,7 +42,7 @@ def _read_records(path: Path, options: ReadOptions) -> TablesOfFile:
                 frame = {}
             elif item := _ITEM.match(line):
                 frame.setdefault(item[1], {})[item[2]] = item[3]
-    return [messages.make_table() for messages in records.values()], ()
+    return [messages.make_table(may_be_local=True) for messages in records.values()], ()
 
 
 scan, read = make_reader("wits0", _read_records)

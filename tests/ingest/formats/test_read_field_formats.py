@@ -219,6 +219,45 @@ def test_dates_and_times_of_wits_may_lack_leading_zeros(
     np.testing.assert_array_equal(raw.time, np.array(expected, "datetime64[ns]"))
 
 
+WITS_OF_TWO_RECORDS = """&&
+0105260314
+0106235959
+01081234.5
+011012.5
+!!
+&&
+0105260315
+0106000000
+01081234.6
+011012.75
+0705260315
+0706000000
+0713 1.25
+!!
+"""
+
+
+@pytest.mark.parametrize("as_channel", [False, True])
+def test_all_records_of_wits_have_the_offset_of_local_times(
+    tmp_path: Path, as_channel: bool
+) -> None:
+    path, log = tmp_path / "rig.wits", tmp_path / "gyro.csv"
+    path.write_text(WITS_OF_TWO_RECORDS)
+    log.write_text("time,gyro_x [deg/h]\n2026-03-15T06:00:00Z,1\n2026-03-15T06:00:01Z,2\n")
+    items = {"0110": "rotation_rate [rpm]", "0713": "vibration [g]"}
+    if as_channel:  # the log has its own offset
+        raw = read_log(log, channel=path, map=items, unit={"time": "UTC-06:00"})
+        assert raw.time.values[0] == np.datetime64("2026-03-15T06:00:00")
+        first = raw.time_rotation_rate
+    else:
+        raw = read_log(path, map=items | {"0108": "gyro_x [deg/h]"}, unit={"time": "UTC-06:00"})
+        first = raw.time
+    assert first.values[0] == np.datetime64("2026-03-15T05:59:59")
+    assert raw.time_vibration.values.tolist() == [
+        np.datetime64("2026-03-15T06:00:00", "ns").astype(np.int64)
+    ]
+
+
 @pytest.mark.parametrize("index", ["measured depth", "elapsed time"])
 def test_witsml_over_anything_but_dates_is_refused(tmp_path: Path, index: str) -> None:
     made = write_witsml(tmp_path)
