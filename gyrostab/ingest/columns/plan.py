@@ -48,7 +48,7 @@ class Column:
 
     source: int
     header: str
-    role: str  # "time", "gyro" or "channel"
+    role: str  # "time", "week" (GPS weeks, which are added to the time), "gyro" or "channel"
     name: str  # "time", the axis, or the channel
     units: str
     factor: float = 1.0

@@ -86,7 +86,7 @@ def plan_columns(
         )
     place = {header.strip(): index for index, header in enumerate(headers)}
     plan.summaries.sort(key=lambda summary: place.get(summary.header, -1))
-    order = {"time": 0, "gyro": 1, "channel": 2}
+    order = {"time": 0, "week": 1, "gyro": 2, "channel": 3}
     plan.columns.sort(
         key=lambda column: (order[column.role], column.name if column.role == "gyro" else "")
     )

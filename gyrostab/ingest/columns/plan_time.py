@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 
 from gyrostab.errors import GyrostabError, MissingUnitError, UnitError
 from gyrostab.ingest.columns.dates import (
@@ -28,10 +30,27 @@ from gyrostab.ingest.columns.headers import (
     time_suffix,
 )
 from gyrostab.ingest.columns.plan import Column, Plan
-from gyrostab.ingest.columns.stamps import TimeUnit, names_epoch, parse_time_unit
+from gyrostab.ingest.columns.stamps import (
+    GPS_EPOCH,
+    GPS_NOTE,
+    GPS_WEEK,
+    MIN_GPS_WEEK,
+    TimeUnit,
+    cells_to_ns,
+    is_number,
+    names_epoch,
+    parse_time_unit,
+    plain_number,
+)
 
 #: Orders of stamps that cannot be read.
 UNREADABLE = (NO_DATE, NAMED_ZONE)
+#: Names of columns of GPS weeks and of times of week, of their letters alone.
+_WEEK_NAME = re.compile(r"(?:gps)?week(?:no|num|number)?|gpswn")
+_TIME_OF_WEEK_NAME = re.compile(
+    r"(?:gps)?(?:i?tow|sow|(?:time|sec(?:ond)?s?)(?:of|in)week)(?:s|sec|ms|us|ns)?"
+    r"|gps(?:time|sec(?:ond)?s?)"
+)
 
 
 def find_time(plan: Plan, named: list[FileColumn]) -> FileColumn | None:
@@ -57,6 +76,7 @@ def find_time(plan: Plan, named: list[FileColumn]) -> FileColumn | None:
     else:
         unit, order, epoch = _time_unit(plan, column), YEAR_FIRST, plan.options.epoch_ns
         written = unit.text if unit else None
+        unit = _add_weeks(plan, column, unit, named)
     planned = Column(
         column.source, column.header, "time", "time", "ns", 1.0, 0.0, unit, order, epoch
     )
@@ -75,6 +95,43 @@ def find_time(plan: Plan, named: list[FileColumn]) -> FileColumn | None:
             f"--epoch is not used: the time column {column.header!r} is in {unit.text!r}"
         )
     return column
+
+
+def _add_weeks(
+    plan: Plan, column: FileColumn, unit: TimeUnit | None, named: list[FileColumn]
+) -> TimeUnit | None:
+    """Plan the GPS weeks of times of week, and return their unit with the beginning of GPS time."""
+    is_dated = plan.options.epoch is not None or unit is None or unit.epoch is not None
+    if is_dated or not _TIME_OF_WEEK_NAME.fullmatch(_letters_of(column)):
+        return unit
+    stamps = cells_to_ns([cell for cell in column.cells if is_number(cell)], unit, 0)
+    candidates = [c for c in named if not c.mapped and _WEEK_NAME.fullmatch(_letters_of(c))]
+    filled = [c for c in candidates if any(map(is_number, c.cells))]
+    if not filled or stamps.min(initial=0) < 0 or stamps.max(initial=0) > GPS_WEEK:
+        return unit
+    weeks = filled[0]
+    numbers = (float(plain_number(cell)) for cell in weeks.cells if is_number(cell))
+    if len(filled) > 1 or max(numbers) < MIN_GPS_WEEK:
+        reason = (
+            f"there are several columns of them, {filled[1].header!r} too"
+            if len(filled) > 1
+            else f"they are below {MIN_GPS_WEEK}, as without a fix or of a counter of 10 bits"
+        )
+        plan.refuse(
+            UnitError,
+            f"{weeks.header!r} may hold the GPS weeks of {column.header!r}, but {reason}; give "
+            "the beginning of the week, for instance --epoch 2026-03-08",
+        )
+        return unit
+    plan.notes.append(f"{weeks.header!r} holds the GPS weeks of {column.header!r}; {GPS_NOTE}")
+    plan.columns.append(Column(weeks.source, weeks.header, "week", "week", "week"))
+    plan.add_summary(weeks, "time", "time", None)
+    named.remove(weeks)
+    return replace(unit, epoch=GPS_EPOCH) if unit else None
+
+
+def _letters_of(column: FileColumn) -> str:
+    return re.sub(r"[^a-z]", "", split_header(column.header)[0].lower())
 
 
 def _find_by_name(named: Sequence[FileColumn]) -> list[FileColumn]:

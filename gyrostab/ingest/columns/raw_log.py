@@ -15,7 +15,7 @@ from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.errors import FormatError
 from gyrostab.ingest.columns.pieces import Buffers, find_even
 from gyrostab.ingest.columns.plan import Column, Plan
-from gyrostab.ingest.columns.stamps import DATENUM, NAT, TurningClock
+from gyrostab.ingest.columns.stamps import DATENUM, NAT, TurningClock, add_weeks
 from gyrostab.ingest.options import FileSummary
 from gyrostab.schema import SIGNAL_UNITS
 from gyrostab.store.lazy import convert_values, read_slice, stack_rows
@@ -100,6 +100,7 @@ class RawLogBuilder:
         self.plan, self.options = plan.check(), plan.options
         self.time = plan.time
         self.gyro, self.channels = plan.of("gyro"), plan.of("channel")
+        self.weeks = plan.of("week")
         dtypes: dict[int, Any] = {
             column.source: np.float64 for column in [*self.gyro, *self.channels]
         }
@@ -126,6 +127,9 @@ class RawLogBuilder:
         size = (
             len(next(iter(values.values()))) if values else len(stamps) if stamps is not None else 0
         )
+        if stamps is not None:
+            for column in self.weeks:
+                stamps = add_weeks(stamps, values[column.source])
         bad = stamps == NAT if stamps is not None else np.zeros(size, dtype=bool)
         bad_cells, ranges, masks = words + int(np.count_nonzero(bad)), {}, []
         declared: dict[int, int] = {}
@@ -172,7 +176,7 @@ class RawLogBuilder:
         self.cell_rows.add(converted.cell_rows, locate, quote)
         self.bad_cells += converted.bad_cells
         self.gyro_cells += converted.cells
-        block: dict[int, Any] = {**converted.values}
+        block: dict[int, Any] = {source: converted.values[source] for source in self.statistics}
         stamps = converted.stamps
         if stamps is not None and self.time is not None:
             stamps = stamps if self.clock is None else self.clock.continue_stamps(stamps)

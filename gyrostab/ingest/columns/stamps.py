@@ -18,7 +18,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from gyrostab.arrays import Array, Ints
+from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.errors import UnitError
 from gyrostab.ingest.columns.dates import YEAR_FIRST, as_iso
 from gyrostab.store.lazy import read_slice
@@ -35,6 +35,11 @@ CLOCK_PERIODS = {
         for tick in (10**3, 10**5, 10**6)
     },
 }
+#: Beginning of GPS time, 1980-01-06, and length of its weeks [ns].
+GPS_EPOCH, GPS_WEEK = 315_964_800 * 10**9, 7 * int(DAY) * 10**9
+#: Weeks below the first one may be counted modulo 1024, or come from a receiver without a fix.
+MIN_GPS_WEEK, MAX_GPS_WEEK = 1024, 9999
+GPS_NOTE = "the stamps are GPS time, which has no leap seconds (18 s ahead of UTC in 2026)"
 #: Steps from which the typical one follows.
 _TYPICAL_STEPS = 4096
 #: The integer of ``NaT``.
@@ -209,6 +214,20 @@ def numbers_to_ns(values: Array, unit: TimeUnit, epoch: int) -> Ints:
     if values.dtype.kind == "u":
         values = np.minimum(values, np.uint64(_MAX_INT64))
     return integers_to_ns(values.astype(np.int64), unit, epoch)
+
+
+def add_weeks(stamps: Ints, weeks: Floats) -> Ints:
+    """Add GPS weeks to the beginning of GPS time plus times of week; `NAT` for other numbers.
+
+    Examples
+    --------
+    >>> add_weeks(np.array([GPS_EPOCH] * 2), np.array([2000.0, 0.0])).astype("datetime64[ns]")
+    array(['2018-05-06T00:00:00.000000000',                           'NaT'],
+          dtype='datetime64[ns]')
+    """
+    is_week = (weeks >= MIN_GPS_WEEK) & (weeks <= MAX_GPS_WEEK) & (weeks == np.rint(weeks))
+    added = np.where(is_week, weeks, 0).astype(np.int64) * GPS_WEEK
+    return np.where(is_week & (stamps != NAT), stamps + added, NAT)
 
 
 def is_number(text: str, *, comma: bool = False) -> bool:

@@ -15,6 +15,7 @@ from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summa
 from gyrostab.ingest.columns.stamps import (
     NANOSECOND,
     NAT,
+    add_weeks,
     cells_to_ns,
     integers_to_ns,
     numbers_to_ns,
@@ -111,7 +112,7 @@ def read_column_batches(
 
     def convert(batch: Batch) -> ConvertedBlock:
         columns, values, words = take(batch), {}, 0
-        for column in [*builder.gyro, *builder.channels]:
+        for column in [*builder.weeks, *builder.gyro, *builder.channels]:
             values[column.source], not_numbers = _to_floats(columns[column.source])
             if column.role == "channel":
                 words += not_numbers + int(np.isinf(values[column.source]).sum())
@@ -153,8 +154,11 @@ def summarise_columns(
     time = plan.time
     if time is None or not rows:
         return summary_of(plan, form, rows, notes=notes)
-    head, tail = (
-        to_stamps(fetch(time.source, *span), time)
-        for span in ((0, min(END_ROWS, rows)), (max(0, rows - END_ROWS), rows))
-    )
+    ends = []
+    for span in ((0, min(END_ROWS, rows)), (max(0, rows - END_ROWS), rows)):
+        stamps = to_stamps(fetch(time.source, *span), time)
+        for column in plan.of("week"):
+            stamps = add_weeks(stamps, _to_floats(fetch(column.source, *span))[0])
+        ends.append(stamps)
+    head, tail = ends
     return summary_of(plan, form, rows, head=head, tail=tail, notes=notes)

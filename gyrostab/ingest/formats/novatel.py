@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from gyrostab.ingest.columns.stamps import NAT
+from gyrostab.ingest.columns.stamps import GPS_EPOCH, GPS_NOTE, GPS_WEEK, MAX_GPS_WEEK, NAT
 from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import Messages, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
@@ -22,8 +22,6 @@ _SYNC = (b"\xaa\x44\x12", b"\xaa\x44\x13")
 _TEXT = re.compile(rb"^[#%][A-Z0-9]{3,}A,[^\r\n]*;", re.MULTILINE)
 _SENSORS = ("gyro", "accel")
 _KINDS = ("RAWIMU", "RAWIMUX", "RAWIMUS", "RAWIMUSX")
-_GPS_EPOCH = 315_964_800  # 1980-01-06 [s since 1970]
-_WEEK = 604_800
 
 
 def matches(path: Path) -> bool:
@@ -40,14 +38,13 @@ def _read_messages(path: Path, options: ReadOptions) -> TablesOfFile:
         if getattr(message, "name", None) not in _KINDS:  # or bytes between messages
             continue
         fields = message.to_dict()
-        week, seconds = int(fields["gps_week"]), float(fields["gps_seconds"])
+        week, since = int(fields["gps_week"]), round(float(fields["gps_seconds"]) * 1e9)
         counts = {f"{kind}_{axis}": fields[f"{kind}_{axis}"] for kind in _SENSORS for axis in "xyz"}
         counts |= {f"{kind}_y": -counts[f"{kind}_y"] for kind in _SENSORS}
-        usable = 0 <= week < 10_000 and 0.0 <= seconds <= _WEEK
-        stamp = (_GPS_EPOCH + week * _WEEK) * 10**9 + round(seconds * 1e9) if usable else NAT
+        usable = 0 <= week <= MAX_GPS_WEEK and 0 <= since <= GPS_WEEK
+        stamp = GPS_EPOCH + week * GPS_WEEK + since if usable else NAT
         by_kind.setdefault(message.name, Messages()).add(stamp, counts)
-    note = "the stamps are GPS time, which has no leap seconds (18 s ahead of UTC in 2026)"
-    return [messages.make_table(kind) for kind, messages in by_kind.items()], [note]
+    return [messages.make_table(kind) for kind, messages in by_kind.items()], [GPS_NOTE]
 
 
 scan, read = make_reader("novatel", _read_messages)

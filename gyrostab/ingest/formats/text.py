@@ -25,9 +25,9 @@ from gyrostab.ingest.columns.headers import describe_cells
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.plan_roles import plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
-from gyrostab.ingest.columns.stamps import NAT, cells_to_ns, is_number
+from gyrostab.ingest.columns.stamps import NAT, add_weeks, cells_to_ns, is_number
 from gyrostab.ingest.options import FileSummary, ReadOptions
-from gyrostab.ingest.text.cells import BlockParser, ParsedBlock, decode_line
+from gyrostab.ingest.text.cells import BlockParser, ParsedBlock, decode_line, parse_numbers
 from gyrostab.ingest.text.layout import Layout, find_layout, is_text, unit_of_duration
 from gyrostab.store.threads import map_in_order
 
@@ -55,7 +55,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     time, rows = plan.time, None
     head = tail = np.empty(0, np.int64)
     if time is not None:
-        head = _sample_stamps(layout, time, layout.samples)
+        head = _sample_stamps(layout, plan, time, layout.samples)
     if not _is_gzipped(path):
         size = path.stat().st_size
         with path.open("rb") as file:
@@ -63,7 +63,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
             ends = [layout.split_row(decode_line(line)) for line in file.read().splitlines()]
             if time is not None:
                 solid = [row for row in ends if _is_solid(row, layout, time.source)]
-                tail = _sample_stamps(layout, time, solid)
+                tail = _sample_stamps(layout, plan, time, solid)
             if size <= COUNTED_BYTES:
                 file.seek(layout.offset)
                 rows = sum(
@@ -154,11 +154,14 @@ def _duration_unit(cells: Sequence[str]) -> str | None:
     return unit if unit and all(unit_of_duration(cell) == unit for cell in cells) else None
 
 
-def _sample_stamps(layout: Layout, time: Column, rows: Sequence[Sequence[str]]) -> Ints:
+def _sample_stamps(layout: Layout, plan: Plan, time: Column, rows: Sequence[Sequence[str]]) -> Ints:
     cells = [row[time.source] for row in rows]
     if time.time_unit is not None:
         cells = [layout.write_point(cell) for cell in cells]
-    return cells_to_ns(cells, time.time_unit, time.epoch, time.date_order)
+    stamps = cells_to_ns(cells, time.time_unit, time.epoch, time.date_order)
+    for column in plan.of("week"):
+        stamps = add_weeks(stamps, parse_numbers([row[column.source] for row in rows], layout))
+    return stamps
 
 
 def _is_solid(row: list[str], layout: Layout, time: int) -> bool:

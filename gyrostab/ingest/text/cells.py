@@ -137,7 +137,7 @@ class BlockParser:
         at, words = np.array(list(lines)), 0
         for number, source in enumerate(self.sources):
             cells = ["" if row is None else row[source] for row in rows]
-            numbers = np.array([_parse_number(cell, self.layout) for cell in cells])
+            numbers = parse_numbers(cells, self.layout)
             values[number, at] = numbers
             if source in self.channels:
                 bad = np.flatnonzero(~np.isfinite(numbers))
@@ -169,6 +169,11 @@ def decode_line(line: bytes) -> str:
         return line.decode("utf-8")
     except UnicodeDecodeError:
         return line.decode("latin-1")
+
+
+def parse_numbers(cells: Sequence[str], layout: Layout) -> Floats:
+    """Convert cells to numbers, NaN where they hold none."""
+    return np.array([_parse_number(cell, layout) for cell in cells])
 
 
 def _parse_number(cell: str, layout: Layout) -> float:

@@ -217,6 +217,11 @@ def test_a_file_of_a_known_program_needs_no_options(tmp_path: Path, name: str) -
         assert float(raw[channel][0]) == pytest.approx(value, rel=1e-9), channel
 
 
+def test_weeks_of_mip_monitor_date_its_times(tmp_path: Path) -> None:
+    raw = read_log(SAMPLES["microstrain-mip"].write_to(tmp_path))
+    assert raw.time.values[0] == np.datetime64("2017-02-17T17:20:10")
+
+
 def test_options_overrule_a_preset(tmp_path: Path) -> None:
     sample = SAMPLES["xsens-mt-manager"]
     path = sample.write_to(tmp_path)

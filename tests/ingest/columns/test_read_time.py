@@ -379,3 +379,92 @@ def test_one_wrong_stamp_is_not_midnight(tmp_path):
     pd.DataFrame({"time [s]": clock, "gyro_x [deg/h]": 1.0}).to_csv(path, index=False)
     stamps = read_log(path).time.values.astype("datetime64[ns]").view(np.int64)
     assert stamps[40] == round(clock[40] * 1e9)
+
+
+WEEK_2300 = np.datetime64("2024-02-04", "ns")  # 1980-01-06 and 2300 weeks
+
+
+def write_weeks(path: Path, header: str, *rows: str) -> Path:
+    path.write_text("\n".join([header, *rows, ""]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("header", "options"),
+    [
+        ("GPS TOW (s),GPS Week,Ang Rate X (deg/s)", {"map": {"Ang Rate X": "gyro_x"}}),
+        ("gps_tow,gps_week,gyro_x [deg/s]", {"map": {"gps_tow": "time [s]"}}),
+        ("GpsToW [s],GpsWeek,gyro_x [deg/s]", {}),
+        ("Time of Week [s],Week No.,gyro_x [deg/s]", {}),
+    ],
+)
+def test_gps_weeks_are_added_to_times_of_week(tmp_path, header, options):
+    """The last second of a week, a row with a quoted cell, and half a minute without rows."""
+    rows = [f"{604799 + n / 10:.2f},2300,{n}" for n in range(10)]
+    rows += ['"0.00",2301,10', *(f"{30 + n / 10:.2f},2301,{n}" for n in range(10))]
+    path = write_weeks(tmp_path / "log.csv", header, *rows)
+    raw = read_log(path, **options)
+    seconds = np.r_[604799 + np.arange(10) / 10, 604800, 604830 + np.arange(10) / 10]
+    expected = WEEK_2300 + np.round(seconds * 1e9).astype("timedelta64[ns]")
+    np.testing.assert_array_equal(raw.time.values, expected)
+    assert sum("GPS time, which has no leap seconds" in note for note in raw.attrs["notes"]) == 1
+    assert not any("--epoch" in note for note in raw.attrs["notes"])
+    assert list(raw.data_vars) == ["rate"]
+    if "map" not in options:
+        summary = scan_file(path)
+        assert (summary.first, summary.last) == (expected[0], expected[-1])
+
+
+def test_gps_weeks_of_parquet_are_added_to_times_of_week(tmp_path):
+    table = pa.table(
+        {
+            "week": pa.array([2300, None, 2300, 0], pa.int32()),
+            "tow [s]": np.arange(4) + 0.5,
+            "gyro_x [deg/s]": np.arange(4.0),
+        }
+    )
+    parquet.write_table(table, tmp_path / "log.parquet")
+    raw = read_log(tmp_path / "log.parquet")
+    assert np.isnat(raw.time.values).tolist() == [False, True, False, True]
+    assert raw.time.values[2] == WEEK_2300 + np.timedelta64(2500, "ms")
+    assert raw.attrs["unreadable_rows"] == 2
+    assert scan_file(tmp_path / "log.parquet").last == raw.time.values[2]
+
+
+def test_rows_before_the_first_gps_week_are_unreadable(tmp_path):
+    rows = ["0,0,1", "0.1,,2", "345600.25,2300,3", "345600.35,2300,4", "345600.45,2300,5"]
+    raw = read_log(write_weeks(tmp_path / "log.csv", "tow [s],week,gyro_x [deg/s]", *rows))
+    assert np.isnat(raw.time.values).tolist() == [True, True, False, False, False]
+    assert raw.time.values[2] == np.datetime64("2024-02-08T00:00:00.25")
+    assert raw.attrs["unreadable_rows"] == 2
+
+
+@pytest.mark.parametrize(
+    ("columns", "cells", "reason"),
+    [
+        ("week", "252", "below 1024"),
+        ("week,gps_week", "2300,2300", "'gps_week' too"),
+    ],
+)
+def test_the_week_is_asked_for_where_it_is_ambiguous(tmp_path, columns, cells, reason):
+    rows = [f"{n},{cells},{n}" for n in range(4)]
+    path = write_weeks(tmp_path / "log.csv", f"tow [s],{columns},gyro_x [deg/s]", *rows)
+    with pytest.raises(UnitError, match=rf"'week' may hold .*{reason}.*--epoch 2026-03-08"):
+        read_log(path)
+    raw = read_log(path, epoch="2026-03-08")
+    assert raw.time.values[1] == np.datetime64("2026-03-08T00:00:01")
+
+
+@pytest.mark.parametrize(
+    ("header", "rows"),
+    [
+        ("time [s],week,gyro_x [deg/s]", ["1.5,2300,1", "2.5,2300,2"]),  # of another clock
+        ("tow [s],week,gyro_x [deg/s]", ["604801.5,2300,1", "604802.5,2300,2"]),
+        ("tow [s],week,gyro_x [deg/s]", ["1.5,,1", "2.5,,2"]),
+        ("tow [s],gyro_x [deg/s]", ["1.5,1", "2.5,2"]),
+    ],
+)
+def test_times_without_a_gps_week_need_an_epoch(tmp_path, header, rows):
+    raw = read_log(write_weeks(tmp_path / "log.csv", header, *rows))
+    assert raw.time.values[0] < np.datetime64("1970-01-09")
+    assert any("give --epoch for another zero" in note for note in raw.attrs["notes"])
