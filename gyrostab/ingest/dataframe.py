@@ -21,14 +21,13 @@ if TYPE_CHECKING:
 
 #: An option of a command with its value, as messages on files advise it.
 _OPTION = re.compile(
-    r"--(map|unit|kind|rate|max-gap|axis)\b"
+    r"--(map|unit|missing-value|kind|rate|max-gap|axis)\b"
     r'(?: ("[^"]*=[^"]*"|[^\s,;:()]+=[^\s,;:()]+)'
-    r"|(?<=kind) (angle|rate)\b|(?<=rate) (HZ|[\d.e+-]+))?"
+    r"|(?<=kind) (angle|rate)\b|(?<=rate|alue) (HZ|[\d.e+-]+))?"
 )
 #: Patterns of advice that only concerns files, and their replacements.
 _FILE_ADVICE = (
     ("; gyrostab scan DataFrame inspects each column", ""),
-    (r"read it as missing with --missing-value \S+", "replace it by nan"),
     (
         "the separator, the columns that --map names and the unit of time",
         "the columns and the index",
@@ -50,6 +49,7 @@ def from_dataframe(
     *,
     units: str | Mapping[str, str] | None = None,
     map: Mapping[str, str] | None = None,
+    missing_value: float | Sequence[float] = (),
     kind: str | None = None,
     rate: float | None = None,
     max_gap: str | float = "10D",
@@ -68,6 +68,9 @@ def from_dataframe(
         (``"gyro_x [deg/s]"``), or in ``df.attrs["units"]``.
     map : mapping, optional
         Column name -> contract name: ``{"wx": "gyro_x"}``; ``"-"`` drops a column.
+    missing_value : float or sequence of float, optional
+        Numbers that mean a missing value in columns of the gyro and of channels, before units are
+        converted: ``-999.25``.
     kind : {"rate", "angle"}, optional
         How angle columns are meant: ``"angle"`` cumulative, ``"rate"`` increments.
     rate : float, optional
@@ -102,7 +105,7 @@ def from_dataframe(
     from gyrostab.ingest.grid.regularise import regularise
 
     with keyword_advice():
-        raw = _read_frame(df, units=units, map=map, kind=kind)
+        raw = _read_frame(df, units=units, map=map, missing_value=missing_value, kind=kind)
         log = regularise(raw, rate=rate, max_gap=max_gap)
     log.attrs["notes"] = [_name_keywords(note) for note in texts(log, "notes")]
     warn_notes(log)
@@ -112,9 +115,10 @@ def from_dataframe(
 def _read_frame(
     frame: pd.DataFrame | pd.Series,
     *,
-    units: str | Mapping[str, str] | None = None,
-    map: Mapping[str, str] | None = None,
-    kind: str | None = None,
+    units: str | Mapping[str, str] | None,
+    map: Mapping[str, str] | None,
+    missing_value: float | Sequence[float],
+    kind: str | None,
 ) -> xr.Dataset:
     """Read a pandas table into a raw log, by the rules for files."""
     from gyrostab.ingest.columns.headers import FileColumn
@@ -140,7 +144,7 @@ def _read_frame(
         )
     headers = [str(column) for column in table.columns]
     units = frame.attrs.get("units") if units is None else units
-    options = _make_options(headers, units=units, map=map, kind=kind)
+    options = _make_options(headers, units=units, map=map, missing_value=missing_value, kind=kind)
     stamps = index.to_numpy()
 
     def fetch(source: int, begin: int, end: int) -> Any:
@@ -167,6 +171,7 @@ def _make_options(
     *,
     units: str | Mapping[str, str] | None,
     map: Mapping[str, str] | None,
+    missing_value: float | Sequence[float],
     kind: str | None,
 ) -> ReadOptions:
     """Convert keywords to options for files; a unit of all axes lets x, y and z name axes."""
@@ -183,7 +188,7 @@ def _make_options(
             if low in ("x", "y", "z") and keys.isdisjoint((low, header.strip().lower()))
         }
     units_by_name = {"gyro": str(units)} if isinstance(units, str) else dict(units or {})
-    return ReadOptions(map=renamed, unit=units_by_name, kind=kind)
+    return ReadOptions(map=renamed, unit=units_by_name, missing_value=missing_value, kind=kind)
 
 
 @contextmanager
@@ -214,7 +219,8 @@ def _name_keywords(message: str) -> str:
             return f"{keyword}={{{key!r}: {target!r}}}"
         if not value or value == "HZ":
             return keyword + f"={value}" * bool(value)
-        return f"{keyword}={value if option == 'rate' else repr(value)}"
+        is_number = option in ("rate", "missing_value")
+        return f"{keyword}={value if is_number else repr(value)}"
 
     for text, replacement in _FILE_ADVICE:
         message = re.sub(text, replacement, message)

@@ -39,7 +39,7 @@ class ReadOptions:
     epoch: str | None = None
     map: Mapping[str, str] = field(default_factory=dict)
     unit: Mapping[str, str] = field(default_factory=dict)
-    missing_value: Sequence[float] = ()
+    missing_value: Any = ()  # a number or several, which become a tuple
     kind: str | None = None
     channel: str | Path | Sequence[str | Path] = ()
     channels_only: bool = False

@@ -137,7 +137,7 @@ def read_log(
         epoch=epoch,
         map=map or {},
         unit=unit or {},
-        missing_value=(missing_value,) if isinstance(missing_value, int | float) else missing_value,
+        missing_value=missing_value,
         kind=kind,
         channel=channel,
         strict=strict,

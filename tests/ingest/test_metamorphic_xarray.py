@@ -838,6 +838,24 @@ def test_notes_on_tables_advise_keywords():
     assert not any("--" in note for note in log.attrs["notes"])
 
 
+def test_a_code_for_missing_values_in_a_table_is_missing_in_its_log():
+    codes = np.arange(200) % 9 == 4
+    gyro, temperature = np.arange(200.0), np.linspace(60.0, 62.0, 200)
+    table = make_table(
+        gyro_x=np.where(codes, -999.25, gyro), temperature=np.where(codes, -9999, temperature)
+    )
+    units = {"gyro": "deg/s", "temperature": "degF"}
+    with pytest.warns(UserWarning, match=r"missing with missing_value=-999\.25"):
+        assert gyrostab.from_dataframe(table, units=units).rate.values.min() == -999.25 * 3600
+    with pytest.warns(UserWarning, match="cells that are -999.25 or -9999 are missing: 22 of"):
+        log = gyrostab.from_dataframe(table, units=units, missing_value=[-999.25, -9999])
+    np.testing.assert_allclose(log.rate.values[0], np.where(codes, np.nan, gyro * 3600))
+    expected = np.where(codes, np.nan, (temperature - 32) / 1.8)
+    np.testing.assert_allclose(log.temperature.values, expected)
+    with pytest.raises(OptionError, match="missing_value nan: give a number"):
+        gyrostab.from_dataframe(table, units=units, missing_value=np.nan)
+
+
 @pytest.mark.parametrize("calendar", ["standard", "noleap", "periods"])
 def test_advice_for_other_dates_gives_a_log(calendar):
     """The calls that the messages advise are run as they are written."""
