@@ -45,13 +45,13 @@ from gyrostab.ingest.formats.tables import (
     Table,
     TableColumn,
     TablesOfFile,
+    first_texts,
     library,
     make_reader,
 )
 from gyrostab.ingest.limits import check_chunk
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.store.damage import check_global_heaps
-from gyrostab.time.stamps import to_nanoseconds
 
 HDF_SUFFIXES = (".h5", ".hdf5")
 _PLAIN_ARRAYS = (
@@ -150,7 +150,7 @@ def _find_clock(columns: Sequence[TableColumn]) -> int | None:
         place
         for place, column in enumerate(columns)
         if TIME_PATTERN.match(column.name[0].rpartition(".")[2].lower())
-        and is_time_unit(column.unit or "")
+        and (column.cells or is_time_unit(column.unit or ""))
     ]
     return clocks[0] if len(clocks) == 1 else None
 
@@ -248,29 +248,37 @@ def _read_tables(path: Path, objects: list[str]) -> Iterator[tuple[int, TableCol
     """Yield length and column for all tables and timetables; row times are columns too.
 
     `objects` describes what the file holds, such as "a table 'log'"; tables are removed from it.
+    MATLAB stores dates with a time zone in UTC. mat-io warns of them without naming the variable,
+    so they let all dates of a file be in UTC.
     """
     if not any(text.startswith(("a table", "a timetable")) for text in objects):
         return
-    with keep_pandas_options():
+    with keep_pandas_options(), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
         matio = library("matio", path, extra="matlab")
         content = matio.load_from_mat(str(path), add_table_attrs=True)
+    zone = "Z" if any("timezone" in str(warning.message) for warning in caught) else ""
     for name, table in content.items():
         if not isinstance(table, pd.DataFrame):
             continue
         objects[:] = [text for text in objects if not text.endswith(f" {name!r}")]
         units = table.attrs.get("VariableUnits") or table.attrs.get("varUnits") or []
         if table.index.dtype.kind in "mM":
-            yield from _make_column(f"{name}.{table.index.name or 'Time'}", table.index.to_numpy())
+            times = table.index.to_numpy()
+            yield from _make_column(f"{name}.{table.index.name or 'Time'}", times, zone)
         for place, variable in enumerate(table.columns):
             unit = str(units[place]) if place < len(units) else ""
-            yield from _make_column(f"{name}.{variable}", table[variable].to_numpy(), unit)
+            yield from _make_column(f"{name}.{variable}", table[variable].to_numpy(), zone, unit)
 
 
-def _make_column(header: str, values: Array, unit: str = "") -> Iterator[tuple[int, TableColumn]]:
-    """Yield length and column of numbers; dates and durations become nanoseconds."""
+def _make_column(
+    header: str, values: Array, zone: str, unit: str = ""
+) -> Iterator[tuple[int, TableColumn]]:
+    """Yield length and column of numbers or of dates in a zone; durations become nanoseconds."""
     if values.dtype.kind == "M":
-        values, unit = to_nanoseconds(values, far_as_nat=True), "nanoseconds since 1970-01-01"
-    elif values.dtype.kind == "m":
+        cells = [text and text + zone for text in first_texts(values)]
+        yield len(values), TableColumn((header,), values, cells=cells)
+    if values.dtype.kind == "m":
         values, unit = values.astype("timedelta64[ns]").view(np.int64), "ns"
     if values.dtype.kind in "biuf":
         attributes = {"units": unit} if unit else {}

@@ -22,7 +22,7 @@ import xarray as xr
 
 from gyrostab.arrays import Array
 from gyrostab.errors import FormatError, OptionError, UnitError
-from gyrostab.ingest.columns.headers import FileColumn
+from gyrostab.ingest.columns.headers import FileColumn, describe_cells
 from gyrostab.ingest.columns.plan import Column, Plan, describe_left_out
 from gyrostab.ingest.columns.plan_roles import plan_columns
 from gyrostab.ingest.columns.stamps import NAT, parse_time_unit
@@ -289,18 +289,18 @@ def _plan_tables(path: Path, tables: Sequence[Table], options: ReadOptions) -> _
 
 def _describe_column(column: TableColumn, name: str, *, stamped: bool = False) -> FileColumn:
     calendar = attribute_text((column.attributes or {}).get("calendar")) or None
-    return FileColumn(
-        name, column.unit, calendar, stamped=stamped, target=column.target, cells=column.cells
-    )
+    described = describe_cells(name, column.unit, column.cells)
+    stamped = stamped or described.stamped
+    return replace(described, calendar=calendar, stamped=stamped, target=column.target)
 
 
 def _add_clock(plan: Plan, source: int, described: Sequence[FileColumn], *, is_named: bool) -> None:
     """Plan the stamps of a table, as planned if both clocks are stored in one unit."""
-    own, time = replace(described[source], header="", cells=()), plan.time
+    own, time = described[source], plan.time
     if (time is None and is_named) or any(column.source == source for column in plan.of("time")):
         return  # the user leaves out the stamps, or they are planned
-    planned = Column(source, described[source].header, "time", "time", "ns")
-    if time is not None and replace(described[time.source], header="", cells=()) == own:
+    planned = Column(source, own.header, "time", "time", "ns")
+    if time is not None and _form_of(described[time.source]) == _form_of(own):
         planned = replace(time, source=source)
     elif own.stored is not None:
         try:
@@ -310,6 +310,10 @@ def _add_clock(plan: Plan, source: int, described: Sequence[FileColumn], *, is_n
             return
         planned = replace(planned, time_unit=unit, epoch=plan.options.epoch_ns)
     plan.columns.append(planned)
+
+
+def _form_of(column: FileColumn) -> tuple[str | None, str | None, bool]:
+    return column.stored, column.calendar, column.stamped
 
 
 def scan_tables(

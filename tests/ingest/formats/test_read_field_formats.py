@@ -378,6 +378,34 @@ def test_timetables_of_matlab_are_read_next_to_vectors(tmp_path: Path) -> None:
     assert any("bias" in note for note in raw.attrs["notes"])
 
 
+@pytest.mark.parametrize("zone", ["", "America/Denver"])
+@pytest.mark.parametrize("version", ["v7", "v7.3"])
+def test_times_of_matlab_may_be_local(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str, zone: str
+) -> None:
+    """A timetable, and another of fewer rows; MATLAB stores times with a zone in UTC."""
+    matio, path = import_matio(), tmp_path / "run.mat"
+    writers = sys.modules["matio.utils.matconvert"].PY_TO_MAT
+    write = writers["datetime"]
+    with_zone = {"tz": np.array([[zone]])} if zone else {}
+    monkeypatch.setitem(writers, "datetime", lambda values: write(values) | with_zone)
+    first = np.datetime64("2026-03-14T23:30:00", "ns")
+    index = pd.DatetimeIndex(first + np.arange(40) * np.timedelta64(100, "ms"), name="Time")
+    rates = pd.DataFrame({"gyro_x": np.arange(40.0)}, index)
+    slow = pd.DataFrame({"temperature": np.arange(4.0)}, index[::10])
+    matio.save_to_mat(str(path), {"imu": rates, "probe": slow}, version=version)
+    units = {"gyro": "deg/s", "temperature": "degC"}
+    raw = read_log(path, unit=units)
+    assert (raw.time.values[0], raw.time_temperature.values[0]) == (first, first)
+    if zone:
+        with pytest.raises(OptionError, match="--unit time: no such column"):
+            read_log(path, unit=units | {"time": "UTC-06:00"})
+        return
+    moved = read_log(path, unit=units | {"time": "UTC-06:00"})
+    for name in ("time", "time_temperature"):
+        np.testing.assert_array_equal(moved[name], raw[name] + np.timedelta64(6, "h"))
+
+
 def test_tables_of_matlab_are_read_where_pandas_lacks_the_option_of_mat_io(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
