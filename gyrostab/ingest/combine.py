@@ -223,12 +223,11 @@ def _concatenate_parts(
         str(name) for part in parts for name in part.data_vars if name != signal
     ):
         holders = [(part.attrs["source_files"][0], part) for part in parts if channel in part]
-        unified = iter(unify_units(holders, channel, _ADVICE.format(channel)))
-        converted = [next(unified)[channel] if channel in part else None for part in parts]
-        held = [column for column in converted if column is not None]
-        columns = [None if column is None else column.data for column in converted]
-        units = held[0].attrs["units"]
-        packing = common_packing(column.encoding for column in held)
+        unified = unify_units(holders, channel, _ADVICE.format(channel))
+        held = iter(log[channel].data for log in unified)
+        columns = [next(held) if channel in part else None for part in parts]
+        units = unified[0][channel].attrs["units"]
+        packing = common_packing(log[channel].encoding for log in unified)
         data[channel] = ("row", join(f"channel {channel}", columns), {"units": units}, packing)
     joined = xr.Dataset(data, coords=coords, attrs=dict(parts[0].attrs))
     joined.attrs.update(

@@ -43,7 +43,18 @@ Locate = Callable[[Sequence[int]], list[str]]
 Quote = Callable[[int], str]
 Values = dict[int, Floats]
 
-_NO_ROWS = np.empty(0, np.int64)
+
+class ColumnRange(NamedTuple):
+    """Numbers of missing values and of codes among them, and range of the other values.
+
+    The range is in the unit of the file.
+    """
+
+    missing: int
+    declared: int
+    low: float
+    high: float
+    is_whole: bool  # whether the other values are whole numbers
 
 
 class ConvertedBlock(NamedTuple):
@@ -52,10 +63,7 @@ class ConvertedBlock(NamedTuple):
     rows: int
     values: Values  # in the inner unit, by column number
     stamps: Ints | None
-    #: Column number -> number of missing values, range of the others in the unit of the file, and
-    #: whether these are whole numbers.
-    ranges: dict[int, tuple[int, float, float, bool]]
-    declared: dict[int, int]  # column number -> number of missing values that were a code
+    ranges: dict[int, ColumnRange]  # by column number
     #: Unreadable rows, and other rows with an unreadable gyro cell.
     bad_rows: Ints
     cell_rows: Ints
@@ -77,16 +85,16 @@ class _Statistics:
     lowest: tuple[float, int] = (np.inf, 0)
     highest: tuple[float, int] = (-np.inf, 0)
 
-    def add(
-        self, cells: Floats, first: int, missing: int, low: float, high: float, is_whole: bool
-    ) -> None:
-        """Add a block from row `first` on, with the findings of `clean_column`."""
-        self.missing += missing
-        if missing == cells.size:
+    def add(self, cells: Floats, first: int, summary: ColumnRange) -> None:
+        """Add a block from row `first` on."""
+        self.missing += summary.missing
+        self.declared += summary.declared
+        if summary.missing == cells.size:
             return
-        self.is_whole &= is_whole
-        self.reach = max(self.reach, -low, high)
-        low, high = sorted(end * self.column.factor + self.column.offset for end in (low, high))
+        self.is_whole &= summary.is_whole
+        ends = summary.low, summary.high
+        self.reach = max(self.reach, -summary.low, summary.high)
+        low, high = sorted(end * self.column.factor + self.column.offset for end in ends)
         if low < self.lowest[0]:
             self.lowest = low, first + int(np.nanargmin(cells))
         if high > self.highest[0]:
@@ -131,34 +139,28 @@ class RawLogBuilder:
             for column in self.weeks:
                 stamps = add_weeks(stamps, values[column.source])
         bad = stamps == NAT if stamps is not None else np.zeros(size, dtype=bool)
-        bad_cells, ranges, masks = words + int(np.count_nonzero(bad)), {}, []
-        declared: dict[int, int] = {}
-        for column in [*self.gyro, *self.channels]:
+        columns = [*self.gyro, *self.channels]
+        is_unreadable, ranges = np.zeros((len(columns), size), dtype=bool), {}
+        for column, mask in zip(columns, is_unreadable, strict=True):
             cells = values[column.source]
-            is_code = find_codes(cells, self.options.missing_value)
-            declared[column.source] = int(np.count_nonzero(is_code))
-            if declared[column.source]:
-                cells[is_code] = np.nan
-            missing, *_ = ranges[column.source] = clean_column(cells, column.factor, column.offset)
-            has_unreadable = missing > declared[column.source]
-            masks.append(~(np.isfinite(cells) | is_code) if has_unreadable else None)
-        gyro = [mask for mask in masks[: len(self.gyro)] if mask is not None]
-        bad_cells += sum(int(np.count_nonzero(mask)) for mask in gyro)
-        if self.gyro and all(mask is not None for mask in masks):
-            bad = bad | np.logical_and.reduce([mask for mask in masks if mask is not None])
-        cell_masks = [mask & ~bad for mask in gyro]
-        cell_rows = np.flatnonzero(np.logical_or.reduce(cell_masks)) if cell_masks else _NO_ROWS
-        n_cells = sum(int(np.count_nonzero(mask)) for mask in cell_masks)
+            np.logical_not(np.isfinite(cells), out=mask)
+            ranges[column.source] = clean_column(
+                cells, column.factor, column.offset, self.options.missing_value
+            )
+        gyro = is_unreadable[: len(self.gyro)]
+        bad_cells = words + int(np.count_nonzero(bad) + np.count_nonzero(gyro))
+        if self.gyro:
+            bad = bad | is_unreadable.all(axis=0)
+        gyro &= ~bad
         return ConvertedBlock(
             size,
             values,
             stamps,
             ranges,
-            declared,
             np.flatnonzero(bad),
-            cell_rows,
+            np.flatnonzero(gyro.any(axis=0)),
             bad_cells,
-            n_cells,
+            int(np.count_nonzero(gyro)),
         )
 
     def add(
@@ -169,8 +171,7 @@ class RawLogBuilder:
             return
         first = self.buffers.rows
         for source, statistics in self.statistics.items():
-            statistics.add(converted.values[source], first, *converted.ranges[source])
-            statistics.declared += converted.declared[source]
+            statistics.add(converted.values[source], first, converted.ranges[source])
         locate = locate or (lambda rows: [f"row {first + row}" for row in rows])
         self.bad_rows.add(converted.bad_rows, locate, quote)
         self.cell_rows.add(converted.cell_rows, locate, quote)
@@ -330,13 +331,12 @@ def find_codes(values: Floats, codes: Sequence[float]) -> Bools:
     return is_code
 
 
-def clean_column(values: Floats, factor: float, offset: float) -> tuple[int, float, float, bool]:
-    """Convert in place, ``values * factor + offset``, and set infinite values to NaN.
-
-    Return the number of values that are not finite, the range of the others before conversion, and
-    whether these are whole numbers.
-    """
-    is_known = np.isfinite(values)
+def clean_column(
+    values: Floats, factor: float, offset: float, codes: Sequence[float] = ()
+) -> ColumnRange:
+    """Convert in place, ``values * factor + offset``; infinite values and codes become NaN."""
+    is_code = find_codes(values, codes)
+    is_known = np.isfinite(values) & ~is_code
     missing = values.size - int(np.count_nonzero(is_known))
     known = values[is_known] if missing else values
     low, high = float(known.min(initial=np.inf)), float(known.max(initial=-np.inf))
@@ -346,7 +346,7 @@ def clean_column(values: Floats, factor: float, offset: float) -> tuple[int, flo
         with np.errstate(over="ignore"):
             values *= factor
             values += offset
-    return missing, low, high, is_whole
+    return ColumnRange(missing, int(np.count_nonzero(is_code)), low, high, is_whole)
 
 
 def _hide_others(stamps: NDArray[np.datetime64], low: int, high: int) -> NDArray[np.datetime64]:

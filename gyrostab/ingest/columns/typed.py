@@ -9,7 +9,6 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Floats, Ints
-from gyrostab.ingest.columns.dates import is_iso
 from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import (
@@ -75,14 +74,6 @@ def to_stamps(values: Any, column: Column) -> Ints:
     else:
         stamps = numbers_to_ns(array, unit, column.epoch)
     return stamps if mask is None else np.where(mask, NAT, stamps)
-
-
-def holds_dates(values: Any) -> bool:
-    """Return whether sample values of a column are dates, or text of ISO 8601."""
-    array = np.asarray(values)
-    return array.dtype.kind == "M" or (
-        array.dtype.kind in "OUST" and any(isinstance(v, str) and is_iso(v) for v in array[:50])
-    )
 
 
 def read_columns(plan: Plan, rows: int, fetch: Fetch, *, notes: Sequence[str] = ()) -> xr.Dataset:

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from gyrostab.arrays import Array, Ints
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.dates import as_iso, find_order
+from gyrostab.ingest.columns.dates import as_iso, find_order, is_iso
 from gyrostab.ingest.columns.headers import is_time_unit
 from gyrostab.ingest.columns.stamps import NAT, floats_to_ns, parse_time_unit, texts_to_ns
-from gyrostab.ingest.columns.typed import holds_dates
 from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import (
     Table,
@@ -60,7 +59,7 @@ def _read_curves(path: Path, options: ReadOptions) -> TablesOfFile:
         TableColumn(
             ("" if any(curve is clock for clock in clocks) else str(curve.mnemonic),),
             np.asarray(curve.data),
-            None if holds_dates(curve.data) else curve.unit,
+            None if any(map(is_iso, first_texts(curve.data))) else curve.unit,
             cells=first_texts(curve.data),
         )
         for curve in curves
@@ -78,7 +77,7 @@ def _find_clock(
     mapped = {name.strip().upper() for name in options.map}
     pair = {"DATE", "TIME"} <= by_name.keys() - mapped
     for curve in time_curves if pair else [*time_curves, *curves[:1]]:
-        if holds_dates(curve.data):
+        if any(map(is_iso, first_texts(curve.data))):
             return [curve], np.asarray(curve.data)
         cells = [_DATE_AND_TIME.match(str(cell).strip()) for cell in curve.data]
         if any(cells[:50]):

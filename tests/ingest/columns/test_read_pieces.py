@@ -111,15 +111,16 @@ def test_results_come_in_the_order_of_the_items_and_few_are_fetched_ahead():
         st.floats(-1e6, 1e6)
         | st.sampled_from([np.nan, np.inf, -np.inf])
         | st.integers(-100, 100).map(float)
+        | st.just(7.0)
     )
 )
 def test_column_is_converted_and_its_range_found(values):
     column = np.array(values, dtype=np.float64)
-    missing, low, high, whole = clean_column(held := column.copy(), 3.7, 0.1)
-    finite = column[np.isfinite(column)]
+    is_known = np.isfinite(column) & (column != 7.0)
+    missing, declared, low, high, whole = clean_column(held := column.copy(), 3.7, 0.1, [7.0])
+    finite = column[is_known]
     assert missing == len(column) - len(finite)
-    assert np.array_equal(
-        held, np.where(np.isfinite(column), column * 3.7 + 0.1, np.nan), equal_nan=True
-    )
+    assert declared == (column == 7.0).sum()
+    assert np.array_equal(held, np.where(is_known, column * 3.7 + 0.1, np.nan), equal_nan=True)
     assert (low, high) == (finite.min(initial=np.inf), finite.max(initial=-np.inf))
     assert whole == (finite == np.rint(finite)).all()
