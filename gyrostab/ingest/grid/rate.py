@@ -302,7 +302,7 @@ def is_far_worse(stamps: Stamps, given: RateEstimate, estimated: RateEstimate) -
 def _estimate_sharp(stamps: Stamps, parts: Parts, rate: float) -> RateEstimate | None:
     """Estimate the rate near a nominal one [Hz] if steps are whole periods, and some are single."""
     period = SECOND / rate
-    steps = find_steps(parts).astype(np.float64)
+    steps = find_steps(parts)
     single = steps[np.abs(steps / period - 1) < 0.25]
     if (
         len(single) == 0

@@ -101,9 +101,9 @@ def fill_stamps(block: Ints) -> Ints:
     return filled
 
 
-def find_steps(parts: Parts) -> Ints:
+def find_steps(parts: Parts) -> Floats:
     """Return the steps [ns] between successive stamps of each stretch."""
-    return np.concatenate([np.diff(part) for part in parts])
+    return np.concatenate([np.diff(part) for part in parts]).astype(np.float64)
 
 
 def sample_stretches(stamps: Stamps) -> Parts:
@@ -203,16 +203,16 @@ def _residual_range(parts: Parts, length: int) -> tuple[Floats, Floats]:
     x = np.arange(length) - (length - 1) / 2
     slope = values @ x / (x @ x)
     residuals = values - slope[:, None] * x
-    return slope, np.ptp(residuals, axis=1) if len(residuals) else np.empty(0)
+    return slope, np.ptp(residuals, axis=1)
 
 
-def _has_shared_stamps(parts: Parts, steps: Floats) -> bool:
+def _has_shared_stamps(parts: Parts) -> bool:
     """Return whether rows share stamps because the clock is coarse, not by doubling."""
-    if np.mean(steps == 0) < SHARED_SHARE:
+    steps, length = find_steps(parts), min(512, *map(len, parts))
+    if np.mean(steps == 0) < SHARED_SHARE or length < 8:
         return False
     tick = np.median(steps[steps > 0])
-    length = min(512, *(len(part) for part in parts)) if parts else 0
-    slope, spread = _residual_range(parts, length) if length >= 8 else (np.empty(0), np.empty(0))
+    slope, spread = _residual_range(parts, length)
     good = slope > 0
     return bool(good.any() and np.median(spread[good] / np.maximum(tick, slope[good])) < 1.3)
 
@@ -223,7 +223,7 @@ def rms_misfit(steps: Floats, period: float) -> float:
     return float(np.sqrt(np.mean((inliers - np.rint(inliers)) ** 2))) if len(inliers) else 0.5
 
 
-def step_scatter(steps: Ints | Floats, period: float) -> float:
+def step_scatter(steps: Floats, period: float) -> float:
     """Return the robust scatter of steps about whole samples [samples]; 0.37 for uniform phases."""
     inliers = steps[np.abs(steps) < 5.5 * period] / period
     return 1.4826 * float(np.median(np.abs(inliers - np.rint(inliers)))) if len(inliers) else 0.5
@@ -260,14 +260,12 @@ def starting_period(stretches: Parts) -> tuple[float, bool, bool]:
     The stretches are those of `sample_stretches`.
     """
     parts = [readable_stamps(stretch) for stretch in stretches]
-    if _has_shared_stamps(parts, find_steps(parts).astype(np.float64)):
+    if _has_shared_stamps(parts):
         return time_per_row(stretches, ticks=True), True, True
     parts, period = find_by_rows(stretches, _stamped_period)
-    return (
-        (time_per_row(stretches), True, False)
-        if _is_bursty(parts, find_steps(parts).astype(np.float64), period)
-        else (period, False, False)
-    )
+    if _is_bursty(parts, period):
+        return time_per_row(stretches), True, False
+    return period, False, False
 
 
 def find_by_rows(stretches: Parts, find: Callable[[Parts], _Period]) -> tuple[Parts, _Period]:
@@ -287,7 +285,7 @@ def find_by_rows(stretches: Parts, find: Callable[[Parts], _Period]) -> tuple[Pa
 
 def _stamped_period(parts: Parts) -> float:
     """Return the period [ns] of stamps near multiples of it."""
-    steps = find_steps(parts).astype(np.float64)
+    steps = find_steps(parts)
     rising = steps[steps > 0]
     period = period_of_lines(parts)
     if period is None:
@@ -302,8 +300,9 @@ def _stamped_period(parts: Parts) -> float:
     return period
 
 
-def _is_bursty(parts: Parts, steps: Floats, period: float) -> bool:
+def _is_bursty(parts: Parts, period: float) -> bool:
     """Return whether long steps are pauses between bursts, not multiples of the short ones."""
+    steps = find_steps(parts)
     long = steps[(steps > 1.5 * period) & (steps < 50 * period)]
     inliers = steps[np.abs(steps) < 50 * period]
     if len(long) <= max(10, _MIN_PAUSE_SHARE * len(steps)) or inliers.sum() <= 1.2 * period * len(
@@ -357,13 +356,11 @@ def losses_accumulate(parts: Parts) -> bool:
     It does if samples are lost at random; pauses between packets of rows do not change the number
     of rows in a long time.
     """
-    steps = find_steps(parts).astype(np.float64)
+    steps = find_steps(parts)
     length = min(_SPAN_ROWS, len(steps) // 16)
     if length < _MIN_SPAN_ROWS:
         return False
-    spans = np.concatenate(
-        [part[length:] - part[:-length] for part in parts if len(part) > length]
-    ).astype(np.float64)
+    spans = np.concatenate([part[length:] - part[:-length] for part in parts if len(part) > length])
     longest = max(np.median(spans), np.median(np.abs(steps)))
     usual = steps[np.abs(steps) <= longest]  # pauses, but no outages or damaged stamps
     scatter = 1.4826 * np.median(np.abs(spans - np.median(spans)))
@@ -372,7 +369,7 @@ def losses_accumulate(parts: Parts) -> bool:
 
 def clock_tick(parts: Parts) -> float:
     """Return the largest time [ns] of which all stamps are multiples, from the first on."""
-    return float(np.gcd.reduce(find_steps(parts)))
+    return float(np.gcd.reduce(np.concatenate([np.diff(part) for part in parts])))
 
 
 def comb_peaks(parts: Parts) -> list[tuple[float, float]]:
