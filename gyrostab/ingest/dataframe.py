@@ -117,10 +117,9 @@ def _read_frame(
     *,
     units: str | Mapping[str, str] | None,
     map: Mapping[str, str] | None,
-    missing_value: float | Sequence[float],
-    kind: str | None,
+    **given: Any,
 ) -> xr.Dataset:
-    """Read a pandas table into a raw log, by the rules for files."""
+    """Read a pandas table into a raw log, by the rules and with options for files."""
     from gyrostab.ingest.columns.headers import FileColumn
     from gyrostab.ingest.columns.plan_roles import plan_columns
     from gyrostab.ingest.columns.typed import read_columns
@@ -144,7 +143,7 @@ def _read_frame(
         )
     headers = [str(column) for column in table.columns]
     units = frame.attrs.get("units") if units is None else units
-    options = _make_options(headers, units=units, map=map, missing_value=missing_value, kind=kind)
+    options = _make_options(headers, units=units, map=map, **given)
     stamps = index.to_numpy()
 
     def fetch(source: int, begin: int, end: int) -> Any:
@@ -171,8 +170,7 @@ def _make_options(
     *,
     units: str | Mapping[str, str] | None,
     map: Mapping[str, str] | None,
-    missing_value: float | Sequence[float],
-    kind: str | None,
+    **given: Any,
 ) -> ReadOptions:
     """Convert keywords to options for files; a unit of all axes lets x, y and z name axes."""
     from gyrostab.ingest.columns.headers import split_header
@@ -188,7 +186,7 @@ def _make_options(
             if low in ("x", "y", "z") and keys.isdisjoint((low, header.strip().lower()))
         }
     units_by_name = {"gyro": str(units)} if isinstance(units, str) else dict(units or {})
-    return ReadOptions(map=renamed, unit=units_by_name, missing_value=missing_value, kind=kind)
+    return ReadOptions(map=renamed, unit=units_by_name, **given)
 
 
 @contextmanager

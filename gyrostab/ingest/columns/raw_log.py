@@ -324,11 +324,8 @@ def find_codes(values: Floats, codes: Sequence[float]) -> Bools:
     >>> find_codes(np.array([0.5, -999.25, 999.99, np.nan]), (-999.25, float(np.float32(999.99))))
     array([False,  True,  True, False])
     """
-    is_code = np.zeros(values.shape, np.bool_)
-    with np.errstate(invalid="ignore"):
-        for code in codes:
-            is_code |= np.abs(values - code) <= _CODE_ROUNDING * abs(code)
-    return is_code
+    pairs = np.isclose(values[:, None], np.array(codes), rtol=_CODE_ROUNDING, atol=0.0)
+    return np.asarray(pairs.any(axis=1))
 
 
 def clean_column(

@@ -281,9 +281,7 @@ def _make_column(
     if values.dtype.kind == "m":
         values, unit = values.astype("timedelta64[ns]").view(np.int64), "ns"
     if values.dtype.kind in "biuf":
-        attributes = {"units": unit} if unit else {}
-        [column] = StoredArray(values, 0).make_columns([header], attributes)
-        yield len(values), column
+        yield len(values), TableColumn((header,), values, unit, dtype=values.dtype)
 
 
 def read_arrays(path: Path, objects: list[str]) -> Arrays:
