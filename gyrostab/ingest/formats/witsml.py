@@ -19,9 +19,14 @@ from xml.etree import ElementTree
 import pandas as pd
 
 from gyrostab.errors import FormatError
-from gyrostab.ingest.columns.stamps import texts_to_ns
 from gyrostab.ingest.formats.recognise import make_matcher
-from gyrostab.ingest.formats.tables import Table, TableColumn, TablesOfFile, make_reader
+from gyrostab.ingest.formats.tables import (
+    Table,
+    TableColumn,
+    TablesOfFile,
+    first_texts,
+    make_reader,
+)
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.ingest.text.layout import split_line
 
@@ -60,11 +65,16 @@ def _make_table(log: Any) -> Table | None:
     if not filled:
         return None
     cells = pd.concat(filled, ignore_index=True)
+
+    def make_column(name: str, column: str, unit: str = "") -> TableColumn:
+        values = cells[column].to_numpy()
+        return TableColumn((name,), values, unit, cells=first_texts(values))
+
     columns = [
-        TableColumn((name,), cells[name].to_numpy(), _child_text(curves.get(name), "unit"))
+        make_column(name, name, _child_text(curves.get(name), "unit"))
         for name in cells.columns.drop(_STAMPS)
     ]
-    return Table(len(cells), columns, TableColumn(("time",), cells[_STAMPS].to_numpy()))
+    return Table(len(cells), columns, make_column("time", _STAMPS))
 
 
 def _curve_place(curve: Any) -> int:
@@ -99,8 +109,7 @@ def _read_block(log: Any, block: Any, curves: Mapping[str, Any]) -> pd.DataFrame
         skip_blank_lines=False,  # those in place of too many cells are unreadable
     ).set_axis(names, axis="columns")
     index = _child_text(log, "indexCurve")
-    stamps = cells.pop(index if index in names else names[0]).astype(str).tolist()
-    return cells.assign(**{_STAMPS: texts_to_ns(stamps).view("datetime64[ns]")})
+    return cells.rename(columns={index if index in names else names[0]: _STAMPS})
 
 
 def _fit_row(line: str, delimiter: str, width: int) -> str:

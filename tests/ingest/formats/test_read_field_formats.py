@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError
+from gyrostab.errors import FormatError, GyrostabError, MissingUnitError, OptionError, UnitError
 from gyrostab.ingest import ReadOptions, read_log, scan_file
 from gyrostab.ingest.formats.layout import crc32_mpeg2
 from gyrostab.ingest.grid.gaps import gap_table
@@ -299,6 +299,24 @@ def list_witsml(names: str, *rows: str) -> str:
     """Return a block of data whose rows begin with the seconds of the index."""
     names = f"<mnemonicList>{names}</mnemonicList>" if names else ""
     return names + "".join(f"<data>2026-05-01T08:00:0{row}</data>" for row in rows)
+
+
+def test_times_of_witsml_may_be_local(tmp_path: Path) -> None:
+    block = list_witsml("TIME,gyro_x", "0,1", "1,2")
+    zoned = list_witsml("TIME,gyro_x", "2.5-06:00,3")
+    for blocks, options, first in (
+        ([block], {}, "08:00"),
+        ([block], {"unit": {"time": "UTC-06:00"}}, "14:00"),
+        ([zoned], {}, "14:00:02.5"),
+    ):
+        path = tmp_path / "log.xml"
+        read_small_witsml(tmp_path, *blocks, *blocks)
+        raw = read_log(path, **options)
+        assert raw.time.values[0] == np.datetime64(f"2026-05-01T{first}")
+    with pytest.raises(OptionError, match="--unit time: no such column"):
+        read_log(path, unit={"time": "UTC-06:00"})
+    with pytest.raises(UnitError, match=r"column 'TZ' holds 'CEST'.*--unit time=UTC"):
+        read_small_witsml(tmp_path, list_witsml("TIME,TZ,gyro_x", "0,CEST,1", "1,CEST,2"))
 
 
 def test_blocks_of_witsml_have_separate_lists_of_curves(tmp_path: Path) -> None:
