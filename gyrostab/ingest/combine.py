@@ -121,7 +121,7 @@ def concatenate(parts: Sequence[xr.Dataset]) -> xr.Dataset:
         groups = _group_by_axes(ordered)
         if is_timed:
             groups = [part for group in groups for part in _in_order(group, signal)]
-        joined = _concatenate_parts([part for group in groups for part in group], signal, groups)
+        joined = _concatenate_groups(groups, signal)
         by_time = sorted(split_parts, key=first_known_stamp) if is_timed else split_parts
         apart = [part[names] for part in by_time if (names := _slow_channels(part))]
         if not is_timed and len(groups) == 1:
@@ -192,9 +192,8 @@ def _begin_at_zero(parts: Sequence[xr.Dataset]) -> bool:
     return bool(np.abs(begins).max() <= _MAX_BEGIN * (lasts - firsts).min())
 
 
-def _concatenate_parts(
-    parts: list[xr.Dataset], signal: str | None, groups: list[list[xr.Dataset]]
-) -> xr.Dataset:
+def _concatenate_groups(groups: list[list[xr.Dataset]], signal: str | None) -> xr.Dataset:
+    parts = [part for group in groups for part in group]
     sizes = [part.sizes["row"] for part in parts]
     names = [part.attrs["source_files"][0] for part in parts]
     absent: dict[str, list[str]] = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+from bisect import bisect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -334,15 +335,12 @@ def _find_lost_spans(
         for path, part in parts.items()
         if "time" in part.variables
     }
-    names = sorted([*spans, *lost], key=name_key)
+    names = sorted(spans, key=name_key)
     lost_spans: dict[Path, Span] = {}
     for path in lost:
-        place = names.index(path)
-        previous_path = next((name for name in reversed(names[:place]) if name in spans), None)
-        next_path = next((name for name in names[place:] if name in spans), None)
-        between = (
-            _span_between(spans, previous_path, next_path) if previous_path and next_path else None
-        )
+        place = bisect(names, name_key(path), key=name_key)
+        has_both = 0 < place < len(names)
+        between = _span_between(spans, names[place - 1], names[place]) if has_both else None
         if span := between or _span_of_stamps(path, options):
             lost_spans[path] = span
     return lost_spans
