@@ -217,7 +217,7 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
                     float(cell["effective_samples"]),
                 )
                 lag, value, r, n = (
-                    "-" if np.isnan(number) else f"{number:.3g}" for number in numbers
+                    "-" if np.isnan(number) else f"{float(f'{number:.3g}'):g}" for number in numbers
                 )
                 p = float(cell["p_value_adjusted"])
                 rows.append(

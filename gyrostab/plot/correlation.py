@@ -23,13 +23,14 @@ from gyrostab.plot.style import (
     write_in_middle,
 )
 from gyrostab.schema import OBSERVED
+from gyrostab.time.durations import format_duration
 from gyrostab.time.stamps import to_nanoseconds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Points while the driver rises, and while it falls.
+#: Points while the driver rises, while it falls, and while it is constant.
 _RISING: dict[str, Any] = {"linestyle": "none", "marker": "^", "color": COLOURS[1]}
 _FALLING: dict[str, Any] = {
     "linestyle": "none",
@@ -37,6 +38,7 @@ _FALLING: dict[str, Any] = {
     "color": COLOURS[0],
     "markerfacecolor": "none",
 }
+_CONSTANT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": "#6e6e6e"}
 _MAX_POINTS = 3000
 
 
@@ -51,8 +53,9 @@ def plot_correlation(
     """Draw every variable against the channel at its lag, by variable (rows) and axis (columns).
 
     Filled triangles pointing up are windows in which the channel rises, open triangles pointing
-    down those in which it falls. The band shows the interval of slopes, about the centre of the
-    data; a line, the sensitivity, is drawn only for the verdict ``coupled``.
+    down those in which it falls, dots those in which it is constant. The band shows the interval of
+    slopes, about the centre of the data; a line, the sensitivity, is drawn only for the verdict
+    ``coupled``.
 
     Parameters
     ----------
@@ -118,7 +121,7 @@ def plot_correlation(
     figure.legend(
         handles=_legend_handles(driver, float(result.attrs.get("interval_level", 0.95))),
         loc="outside lower center",
-        ncols=2 if is_narrow(figure) else 4,
+        ncols=2 if is_narrow(figure) else 3,
         frameon=False,
     )
     return figure
@@ -128,14 +131,14 @@ def _draw_panel(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> No
     cell = part.sel(variable=variable, driver=driver)
     lag = float(np.nan_to_num(cell["coupling_lag"]))
     longest = sum(float(part.attrs.get(name, 0.0)) for name in ("window_s", "step_s"))
-    x, rising = _shift_driver(part[driver], lag, longest)
+    x, change = _shift_driver(part[driver], lag, longest)
     y = part[variable].values
     good = np.isfinite(x) & np.isfinite(y)
     if variable in LAWS and "observable" in part:
         good &= part["observable"].sel(term=variable).values == OBSERVED
     every = max(1, int(good.sum()) // _MAX_POINTS)
-    for part_of, style in ((rising, _RISING), (~rising, _FALLING)):
-        chosen = np.flatnonzero(good & part_of)[::every]
+    for direction, style in ((1, _RISING), (-1, _FALLING), (0, _CONSTANT)):
+        chosen = np.flatnonzero(good & (np.sign(change) == direction))[::every]
         panel.plot(x[chosen], y[chosen], markersize=3.5, alpha=0.75, markeredgewidth=0.7, **style)
     verdict = VERDICTS[int(cell["coupling_verdict"])]
     title = _verdict_text(verdict, lag, float(cell["p_value_adjusted"]))
@@ -163,7 +166,7 @@ def _draw_panel(panel: Axes, part: xr.Dataset, variable: str, driver: str) -> No
 
 def _verdict_text(verdict: str, lag: float, p: float) -> str:
     """Write the title of a panel; the p-value only if it belongs to the verdict."""
-    late = f", {lag:.3g} s late" if lag else ""
+    late = f", {format_duration(lag, ' ')} late" if lag else ""
     if verdict == "cannot_tell":
         return "cannot tell"
     if verdict == "not_told_apart":
@@ -172,19 +175,19 @@ def _verdict_text(verdict: str, lag: float, p: float) -> str:
 
 
 def _shift_driver(driver: xr.DataArray, lag: float, longest: float) -> tuple[Any, Any]:
-    """Shift the driver by the lag, and find where it rises.
+    """Shift the driver by the lag, and find its rate of change.
 
     NaN before the record, and in gaps that `gyrostab.correlate` does not bridge.
     """
     values = driver.values.astype(np.float64)
     is_finite = np.isfinite(values)
     if is_finite.sum() < 3:
-        return np.full(values.size, np.nan), np.zeros(values.size, bool)
+        return np.full(values.size, np.nan), np.zeros(values.size)
     stamps, values = to_nanoseconds(driver["time"].values), values[is_finite]
     at, stamps = stamps - round(1e9 * lag), stamps[is_finite]
     spacing = float(np.median(np.diff(stamps)))
     moved = interpolate_values(values, stamps, at, max(1e9 * longest, MAX_GAP_SPACINGS * spacing))
-    return moved, np.interp(at, stamps, np.gradient(values, stamps)) > 0
+    return moved, np.interp(at, stamps, np.gradient(values, stamps))
 
 
 def _legend_handles(driver: str, level: float) -> list[Any]:
@@ -195,6 +198,7 @@ def _legend_handles(driver: str, level: float) -> list[Any]:
     return [
         Line2D([], [], **_RISING, label=f"{channel_name} rises"),
         Line2D([], [], **_FALLING, label=f"{channel_name} falls"),
+        Line2D([], [], **_CONSTANT, label=f"{channel_name} constant"),
         Patch(
             facecolor="#8c8c8c",
             alpha=0.3,

@@ -15,7 +15,7 @@ from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.dates import date2num
 from scipy.stats import chi2
 
-from gyrostab import davar, fit_noise, make_log
+from gyrostab import correlate, correlation_rows, davar, fit_noise, make_log, plot_correlation
 from gyrostab.allan.confidence import interval_limits
 from gyrostab.allan.fit import refit
 from gyrostab.errors import OptionError, SchemaError
@@ -25,7 +25,7 @@ from gyrostab.plot.correlation import _shift_driver
 from gyrostab.plot.signal import thin
 from gyrostab.plot.style import COLOURS, axis_style, save_png
 from gyrostab.report.product import write_report
-from tests.support import synthetic
+from tests.support import coupled, synthetic
 from tests.support.repetitions import first_of
 
 
@@ -423,8 +423,28 @@ def test_points_are_drawn_where_the_fit_knows_the_channel():
     values = np.where((np.arange(40) >= 10) & (np.arange(40) < 20), np.nan, np.arange(40.0))
     values[30] = np.nan
     driver = xr.DataArray(values, {"time": time})
-    moved, rises = _shift_driver(driver, 60.0, 120.0)
-    assert rises.all()
+    moved, change = _shift_driver(driver, 60.0, 120.0)
+    assert (change > 0.0).all()
     known = np.r_[1:11, 21:40]
     np.testing.assert_allclose(moved[known], known - 1.0)
     assert np.isnan(moved[[0, *range(11, 21)]]).all()
+
+
+def test_a_constant_channel_neither_rises_nor_falls():
+    product = coupled.product(axes="x", terms=False, gap=False)
+    course = np.r_[np.full(60, 20.0), np.linspace(20.0, 50.0, 31)[1:], np.full(30, 50.0)]
+    product["temperature"] = product["temperature"].copy(data=course)
+    result = correlate(product, channel="temperature", variables="window_mean", max_lag=0)
+    (panel,) = plot_correlation(result, driver="temperature").axes
+    points = {line.get_marker(): line.get_xdata().size for line in panel.lines}
+    assert points["v"] == 0
+    assert points["o"] > 80
+    assert points["^"] + points["o"] == 120
+
+
+def test_a_long_lag_is_written_without_an_exponent():
+    product = coupled.product(axes="x", terms=False, slope=0.3, noises="white")
+    result = correlate(product, variables="window_mean", max_lag=0)
+    result["coupling_lag"] = xr.full_like(result["coupling_lag"], 1920.0)
+    assert correlation_rows(result)[0]["lag [s]"] == "1920"
+    assert ", 32 min late, p" in plot_correlation(result).axes[0].get_title()
