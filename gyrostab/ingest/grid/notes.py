@@ -306,8 +306,8 @@ def describe_placement(
     ]
     nothing = "no row holds a number for"
     notes += [
-        f"{where}: {nothing} axis {axis}; is its column empty, or the wrong one? --axis names the "
-        "axes to analyse"
+        f"{where}: {nothing} axis {axis}; is its column empty, or the wrong one? --map HEADER=- "
+        "drops a column"
         for axis in scanned.empty
     ]
     notes += [

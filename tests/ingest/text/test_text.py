@@ -420,6 +420,7 @@ def test_axes_and_channels_without_a_number_are_named(tmp_path: Path, damage: st
     named = ["axis z", "channel temperature"] if not damage else []
     for name in named:
         assert f"no row holds a number for {name}" in text
+    assert ("--map HEADER=- drops" in text) == (not damage)  # every reading command has --map
     assert ("lines 2 ('0,0,0,,'), 3, 4" in text) == bool(damage)
 
 
