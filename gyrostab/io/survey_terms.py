@@ -40,6 +40,7 @@ from gyrostab.io.survey_model import KINDS, TABLES, Groups, Status, SurveyModel,
 from gyrostab.noise import LAWS
 from gyrostab.schema import texts, with_axis
 from gyrostab.time.durations import duration_seconds
+from gyrostab.units import HOUR
 
 if TYPE_CHECKING:
     from gyrostab.diagnose.result.diagnosis import Diagnosis
@@ -182,7 +183,11 @@ def survey_terms(
         tuple(terms),
         _find_ranges(product),
         _describe_origin(product, times, statistic),
-        (_CONFIRM, *_make_notes(product, terms, times["section"], content)),
+        (
+            _CONFIRM,
+            *_note_ramps(summaries, times),
+            *_make_notes(product, terms, times["section"], content),
+        ),
     )
 
 
@@ -305,6 +310,18 @@ def _find_ranges(product: xr.Dataset) -> dict[str, tuple[float, float, str]]:
         for name, channel in product.data_vars.items()
         if channel.dims == ("time",) and channel.dtype.kind == "f" and channel.notnull().any()
     }
+
+
+def _note_ramps(summaries: Iterable[TermSummary], times: Mapping[str, float]) -> list[str]:
+    """Say by how much observed rate ramps change the bias, as no term includes them."""
+    hours = (times["section"] + times["calibration"]) / 2.0 / HOUR
+    return [
+        f"R of axis {summary.axis} ({summary.value:.3g} {summary.unit}) is in no term: such a ramp "
+        f"changes the bias by {summary.value * hours:.3g} deg/h from the calibration to the "
+        "section. Log after the warm-up, or add it to bias and drift."
+        for summary in summaries
+        if (summary.symbol, summary.status) == ("R", "observed")
+    ]
 
 
 def _make_notes(

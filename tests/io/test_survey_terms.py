@@ -130,6 +130,15 @@ def test_limit_stays_marked_as_limit():
     assert {term.status for term in model.terms if term.code.endswith(("RN", "RW"))} == {"observed"}
 
 
+def test_a_ramp_that_is_observed_is_named_with_the_change_of_the_bias():
+    product = make_product("xz")
+    product["R"][:] = np.array([[4.0], [6.0]])
+    product["observable"].loc[{"term": "R", "axis": "x"}] = OBSERVABLE.index("upper_limit_only")
+    (note,) = (note for note in survey_terms(product, **TIMES).notes if "ramp" in note)
+    assert note.startswith("R of axis z (6 deg/h^2) is in no term")
+    assert " by 9 deg/h " in note  # 6 deg/h^2 over the 1.5 h between the middles
+
+
 def test_term_that_no_window_shows_is_named_and_has_no_value():
     product = make_product("x")
     set_state(product, "B", "not_observable")
