@@ -238,16 +238,18 @@ def format_product(product: xr.Dataset) -> str:
     windows = product.sizes["time"]
     # together, because dask spends milliseconds on each variable
     product = product.assign(product.drop_dims("tau").compute().data_vars)
-    lines = [
-        f"Noise coefficients, median over {windows} window{'s' * (windows != 1)} "
-        "(<: 95 % upper limit)",
-        "",
-    ]
-    rows = [("axis", "term", "median", "5 % to 95 %", "unit", "observed in")]
+    if windows == 1:
+        over, columns = " of a single window", ("value", "standard error")
+    else:
+        over, columns = f", median over {windows} windows", ("median", "5 % to 95 %")
+    lines = [f"Noise coefficients{over} (<: 95 % upper limit)", ""]
+    rows = [("axis", "term", *columns, "unit", "observed in")]
     for term in summarise_terms(product):
         spread = ""
-        if term.status == "observed":
+        if term.status == "observed" and windows > 1:
             spread = f"{_number_text(term.low)} to {_number_text(term.high)}"
+        elif term.status == "observed":
+            spread = _number_text(float(product[f"{term.symbol}_stderr"].sel(axis=term.axis)[0]))
         sign = "< " if term.status == "upper_limit_only" else ""
         rows.append(
             (

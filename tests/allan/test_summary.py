@@ -76,6 +76,15 @@ def test_fit_from_the_proposed_averaging_time_describes_the_record():
     assert (white.status, white.value) == ("observed", pytest.approx(0.01, rel=0.1))
 
 
+def test_a_single_window_has_standard_errors_in_place_of_a_range():
+    product = make_product(white(12_000, 7), window="2min")
+    lines = format_product(product).splitlines()
+    assert "of a single window" in lines[0]
+    assert lines[2].split()[2:5] == ["value", "standard", "error"]
+    row = next(line.split() for line in lines if line.split()[1:2] == ["N"])
+    assert float(row[3]) == pytest.approx(float(product["N_stderr"][0, 0]), rel=0.01)
+
+
 def test_single_outliers_are_counted_and_noisy_spans_are_not():
     rng = np.random.default_rng(4)
     values = rng.standard_normal(40_000)
