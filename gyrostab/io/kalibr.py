@@ -50,7 +50,7 @@ from gyrostab.ingest.convert import as_log
 from gyrostab.ingest.make_log import make_log
 from gyrostab.ingest.uniform import cut_log
 from gyrostab.noise import LAWS
-from gyrostab.schema import check_product, texts, with_axis
+from gyrostab.schema import check_product, describe_times, texts, with_axis
 from gyrostab.store.output import new_output
 from gyrostab.units import HOUR
 
@@ -99,7 +99,9 @@ def _fit_accelerometers(log: xr.Dataset, product: xr.Dataset) -> xr.Dataset:
     try:
         log = cut_log(log, **ends)
     except OptionError as error:
-        raise SchemaError(f"the log does not cover the windows of the product: {error}") from error
+        raise SchemaError(
+            f"the log does not cover the windows of the product: {describe_times(log, product)}"
+        ) from error
     names = [
         name
         for name in ("accel_x", "accel_y", "accel_z")

@@ -10,12 +10,13 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.allan.variance import variance_name
+from gyrostab.errors import SchemaError
 from gyrostab.ingest.convert import as_log
 from gyrostab.noise import LAWS
 from gyrostab.plot.style import axis_names, encode_png, unit_symbol
 from gyrostab.report.charts import page_text
 from gyrostab.report.product_charts import product_charts, window_data
-from gyrostab.schema import GAP_CAUSES, check_product, texts, with_axis
+from gyrostab.schema import GAP_CAUSES, check_product, describe_times, texts, with_axis
 from gyrostab.store.output import new_output
 from gyrostab.time.durations import format_duration
 from gyrostab.wording import format_share
@@ -58,7 +59,7 @@ def write_report(
     Raises
     ------
     SchemaError
-        If `product` is not a product or `log` is not a log.
+        If `product` is not a product, or `log` is not a log or one of another time.
     OutputError
         If the file exists or cannot be written.
 
@@ -76,6 +77,9 @@ def write_report(
     check_product(product)
     if log is not None:
         log = as_log(log)
+        times, windows = log["time"][[0, -1]].values, product["time"][[0, -1]].values
+        if windows[1] < times[0] or times[1] < windows[0]:
+            raise SchemaError(f"the log holds no window: {describe_times(log, product)} (--log)")
     from gyrostab.allan.judgement import judge_product
     from gyrostab.allan.summary import summarise_terms
 

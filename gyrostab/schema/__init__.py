@@ -13,6 +13,7 @@ from gyrostab.schema.checks import check_log as check_log
 from gyrostab.schema.checks import check_product as check_product
 from gyrostab.schema.checks import check_raw as check_raw
 from gyrostab.schema.checks import check_surface as check_surface
+from gyrostab.schema.checks import describe_times as describe_times
 from gyrostab.schema.checks import escape_text as escape_text
 from gyrostab.schema.checks import find_unusable_channels as find_unusable_channels
 from gyrostab.schema.checks import is_rate_of_change as is_rate_of_change

@@ -314,6 +314,25 @@ def with_axis(product: xr.Dataset) -> xr.Dataset:
     return product.assign({name: product[name].expand_dims("axis") for name in names})
 
 
+def describe_times(log: xr.Dataset, product: xr.Dataset) -> str:
+    """Describe the times of a log and of the windows of a product that do not belong together.
+
+    Examples
+    --------
+    >>> log = xr.Dataset(coords={"time": np.array(["2026-05-01", "2026-05-02"], "datetime64[ns]")})
+    >>> describe_times(log, log.assign_coords(time=log["time"] + np.timedelta64(1, "h")))[:67]
+    'the log goes from 2026-05-01T00:00:00 to 2026-05-02T00:00:00, and t'
+    """
+    (start, end), (first, last) = (
+        np.datetime_as_string(times.values[[0, -1]], unit="s")
+        for times in (log["time"], product["time"])
+    )
+    return (
+        f"the log goes from {start} to {end}, and the windows of the product are centred from "
+        f"{first} to {last}; give the log of this product"
+    )
+
+
 def check_surface(surface: xr.Dataset) -> None:
     """Raise `SchemaError` unless `surface` is what `gyrostab.davar` returns, or a part of it."""
     cube = ("axis", "time", "tau")

@@ -7,6 +7,7 @@ import re
 from html.parser import HTMLParser
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from gyrostab.allan.fit import fit_noise
@@ -168,6 +169,10 @@ def test_existing_report_and_wrong_input_are_refused(tmp_path):
         write_report(synthetic.surface(), path, overwrite=True)
     with pytest.raises(SchemaError):
         write_report(synthetic.product(), path, log=synthetic.surface(), overwrite=True)
+    product = synthetic.product()
+    later = product.assign_coords(time=product.time + pd.Timedelta("1D"))
+    with pytest.raises(SchemaError, match="the log holds no window: the log goes from 2026-"):
+        write_report(later, path, log=synthetic.log(), overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
