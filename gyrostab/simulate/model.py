@@ -390,11 +390,9 @@ def _check_arguments(
 ) -> None:
     """Raise `OptionError` for parameters that are unknown, missing, or of a wrong type."""
     units = PROFILES[name][1]
+    listed = ", ".join(f"{item} [{units[item]}]" if item in units else item for item in arguments)
     for key in values:
         if key not in arguments:
-            listed = ", ".join(
-                f"{item} [{units[item]}]" if item in units else item for item in arguments
-            )
             raise OptionError(
                 f"{where}: profile {name!r} has no parameter {key!r}"
                 f"{close_to(key, list(arguments))}; it has {listed}"
@@ -402,8 +400,8 @@ def _check_arguments(
     for key, item in arguments.items():
         if item.default is inspect.Parameter.empty and key not in values:
             raise OptionError(
-                f"{where}: profile {name!r} lacks {key!r}; "
-                f"see {PROFILES[name][0].__module__}.{name} for its parameters"
+                f"{where}: profile {name!r} lacks the parameter {key!r}; it has {listed}; "
+                "see docs/simulate.md"
             )
     for key, value in values.items():
         kind, expected = (

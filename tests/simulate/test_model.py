@@ -55,8 +55,11 @@ from tests.support.simulated import BIASED, LOG, WORLD, model
             {"environment": [{"profile": "chamber", "speeed": 1}]},
             r"no parameter 'speeed' .did you mean 'speed'.*speed \[degC/min\]",
         ),
-        ({"environment": [{"profile": "vibration"}]}, "lacks 'points'"),
-        ({"environment": [{"profile": "rotation"}]}, "see gyrostab.simulate.turning.rotation for"),
+        (
+            {"environment": [{"profile": "vibration"}]},
+            "lacks the parameter 'points'; it has points, ",
+        ),
+        ({"environment": [{"profile": "rotation"}]}, "stick_slip .*; see docs/simulate.md"),
         ({"environment": [{"profile": "vibration", "points": [[5, 1], [0, 1]]}]}, "do not rise"),
         (
             {"environment": [{"profile": "vibration", "points": [1, 2]}]},
