@@ -168,8 +168,9 @@ def _list_channels(channel: Any) -> list[str | xr.DataArray]:
     for item in channels:
         if not isinstance(item, str | xr.DataArray):
             raise OptionError(
-                f"channel={item!r} is neither a name nor an xarray.DataArray; a pandas.Series on "
-                "dates becomes one with .to_xarray().assign_attrs(units=...)"
+                f"a channel of type {type(item).__name__} is neither a name nor an "
+                "xarray.DataArray; a pandas.Series on dates becomes one with "
+                ".to_xarray().assign_attrs(units=...)"
             )
     return channels
 

@@ -280,8 +280,9 @@ def _check_channel(channel: xr.DataArray, product: xr.Dataset) -> tuple[Floats, 
         )
         raise TimeError(
             f"channel {channel.name!r} {extent}, the product {_stamp_text(bounds[0, 0])} to "
-            f"{_stamp_text(bounds[-1, 1])}: they do not overlap; check the file, or the zero of "
-            "its time with epoch (--epoch)"
+            f"{_stamp_text(bounds[-1, 1])}: they do not overlap; if the file is in local time, "
+            "give its offset from UTC with unit (--unit time=UTC-06:00), and if its time is a "
+            "number, the zero of it with epoch (--epoch)"
         )
     return values, stamps
 
