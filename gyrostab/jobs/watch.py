@@ -173,6 +173,10 @@ def _follow_source(
 ) -> None:
     """Update a view until the stream has ended, nothing has come for long, or Ctrl-C."""
     changed = time.monotonic()
+    if keeper is None and not list_files(source):
+        view.listener.show_note(
+            f"waiting: there is no file at {source} yet; subfolders are not followed"
+        )
     with contextlib.suppress(KeyboardInterrupt):
         while True:
             ended = keeper is not None and keeper.ended

@@ -392,8 +392,11 @@ def test_a_product_of_another_source_or_of_files_that_are_gone_is_refused(tmp_pa
 
 
 def test_what_cannot_be_followed_is_said(tmp_path):
+    listener = Recorder()
     with pytest.raises(FormatError, match="no row was received"):
-        follow(tmp_path / "nothing.csv", tmp_path / "a.zarr")
+        follow(tmp_path / "nothing.csv", tmp_path / "a.zarr", listener)
+    (note,) = listener.notes
+    assert f"there is no file at {tmp_path / 'nothing.csv'} yet" in note
     short = tmp_path / "short.csv"
     short.write_text(HEADER + "".join(make_rows(500)))
     with pytest.raises(OptionError, match="longer than the record"):
