@@ -330,6 +330,8 @@ def _describe_misfit(product: xr.Dataset) -> list[str]:
                 "no tau_min (--fit-from) changes that: look for spectral lines, vibration or "
                 "motion in the record"
             )
+        if len(product.attrs.get("fit_terms", LAWS)) < len(LAWS):
+            remedy += f", or fit all terms (--terms {''.join(LAWS)})"
         lines.append(f"{line}; {remedy}.")
     return lines
 

@@ -76,6 +76,14 @@ def test_fit_from_the_proposed_averaging_time_describes_the_record():
     assert (white.status, white.value) == ("observed", pytest.approx(0.01, rel=0.1))
 
 
+@pytest.mark.parametrize(("terms", "advised"), [("NB", True), ("QNBKR", False)])
+def test_terms_that_were_left_out_are_named_as_a_reason_of_misfit(terms, advised):
+    line = white(12_000, 8) + 20.0 * np.sin(0.3 * np.arange(12_000))  # which no term describes
+    lines = describe_record(make_product(line, window="1min", terms=terms, tau_min="all"))
+    misfit = next(line for line in lines if line.startswith("The terms do not describe x"))
+    assert misfit.endswith(", or fit all terms (--terms QNBKR).") == advised
+
+
 def test_a_single_window_has_standard_errors_in_place_of_a_range():
     product = make_product(white(12_000, 7), window="2min")
     lines = format_product(product).splitlines()
