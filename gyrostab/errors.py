@@ -28,6 +28,10 @@ class FormatError(GyrostabError, ValueError):
     """A file cannot be read as the format it claims to be, or holds no usable rows."""
 
 
+class FailedRunsError(FormatError):
+    """Runs of a fleet failed; all others are complete."""
+
+
 class DamageError(FormatError):
     """A library failed while it read a file; ``__cause__`` is the exception that it raised."""
 

@@ -22,7 +22,7 @@ from typing import Any
 
 import pandas as pd
 
-from gyrostab.errors import FormatError, GyrostabError, WorkerError
+from gyrostab.errors import FailedRunsError, GyrostabError, WorkerError
 from gyrostab.io.opening import open_dataset
 from gyrostab.jobs.archive import LogRun, find_archive, find_runs, index_files, is_fleet
 from gyrostab.jobs.fleet_output import (
@@ -169,7 +169,7 @@ def run_fleet(
 
     Raises
     ------
-    FormatError
+    FailedRunsError
         At the end, when a run has failed.
     WorkerError, KeyboardInterrupt
         When the workers fail, or at an interruption; the message says how much is done.
@@ -220,7 +220,7 @@ def run_fleet(
         names = ", ".join(failed["run"][:_MAX_NAMES])
         page = Path(output) / "index.html"
         more = f" and {len(failed) - _MAX_NAMES} more" if len(failed) > _MAX_NAMES else ""
-        raise FormatError(
+        raise FailedRunsError(
             f"{len(failed)} of {len(rows)} runs failed: {names}{more}; "
             f"{find_url(page) or page} lists the reasons"
         )

@@ -204,7 +204,7 @@ def _describe_term(row: Mapping[Any, Any], term: str, axes: list[str]) -> dict[s
             texts.append(f"{value:.3g}")
             values.append(float(value))
         else:
-            texts.append(f"< {limit:.2g}" if np.isfinite(limit) else "–")
+            texts.append(f"< {float(f'{limit:.2g}'):g}" if np.isfinite(limit) else "–")
     return {"text": " / ".join(texts), "value": max(values)}
 
 

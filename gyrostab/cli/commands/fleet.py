@@ -106,27 +106,34 @@ def fleet(
         Where to compute: processes, the workers of a dask scheduler, given by its address,
         tcp://cluster:8786, or threads: one run after the other in this process.
     """
+    from gyrostab.errors import FailedRunsError
     from gyrostab.jobs.fleet import run_fleet
     from gyrostab.jobs.fleet_table import FILES, read_table
 
+    failure = None
     with show_stages(common) as stage:
-        table = run_fleet(
-            archive,
-            output,
-            per=per,
-            tool=tool,
-            reading=reading.options(),
-            windows=windows.options(),
-            fitting=fitting.options(),
-            reports=reports,
-            overwrite=common.overwrite,
-            scheduler=scheduler,
-            workers=common.workers,
-            stage=stage,
-        )
+        try:
+            table = run_fleet(
+                archive,
+                output,
+                per=per,
+                tool=tool,
+                reading=reading.options(),
+                windows=windows.options(),
+                fitting=fitting.options(),
+                reports=reports,
+                overwrite=common.overwrite,
+                scheduler=scheduler,
+                workers=common.workers,
+                stage=stage,
+            )
+        except FailedRunsError as error:
+            failure = error
     files = read_table(output / "files.parquet", content=FILES)
     if files is not None:
         _print_left_out(files, output / "files.parquet")
+    if failure is not None:
+        raise failure
     tools = table["tool"].nunique()
     print(f"{len(table)} run{'s'[: len(table) != 1]} of {tools} tool{'s'[: tools != 1]}")
     for path in (output / "index.html", output):
