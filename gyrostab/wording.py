@@ -42,15 +42,17 @@ def format_share(share: float) -> str:
     return "> 99 %" if 0.99 < share < 1.0 else f"{100.0 * share:.0f} %"
 
 
-def format_rounded(value: float) -> str:
-    """Format a number to two digits; a large one is written out, without an exponent.
+def format_rounded(value: float, digits: int = 2) -> str:
+    """Format a number to some digits; a large one is written out, without an exponent.
 
     Examples
     --------
     >>> format_rounded(123.4), format_rounded(0.0123), format_rounded(1.2e-7)
     ('120', '0.012', '1.2e-07')
+    >>> format_rounded(1920.4, 3)
+    '1920'
     """
-    text = f"{value:.2g}"
+    text = f"{value:.{digits}g}"
     return f"{float(text):.0f}" if "e+" in text else text
 
 

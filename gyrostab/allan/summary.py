@@ -14,7 +14,7 @@ from gyrostab.allan.window_fit import is_described
 from gyrostab.arrays import Bools, Floats
 from gyrostab.noise import LAWS
 from gyrostab.schema import OBSERVED, UPPER_LIMIT_ONLY, check_product
-from gyrostab.wording import format_share
+from gyrostab.wording import format_rounded, format_share
 
 #: Largest number of windows that are fitted again to find the averaging time from which the terms
 #: describe the record.
@@ -288,7 +288,7 @@ def describe_record(product: xr.Dataset) -> list[str]:
 
 
 def _number_text(value: float) -> str:
-    return f"{float(f'{value:.3g}'):g}" if np.isfinite(value) else "-"
+    return format_rounded(value, 3) if np.isfinite(value) else "-"
 
 
 def _share_or_all(share: float) -> str:

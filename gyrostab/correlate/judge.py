@@ -10,6 +10,7 @@ import xarray as xr
 from gyrostab.arrays import Floats, Ints
 from gyrostab.correlate.drivers import slope_units
 from gyrostab.errors import SchemaError
+from gyrostab.wording import format_rounded
 
 #: Flag values of ``coupling_verdict``.
 VERDICTS = ("cannot_tell", "none_seen", "not_told_apart", "coupled")
@@ -217,7 +218,7 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
                     float(cell["effective_samples"]),
                 )
                 lag, value, r, n = (
-                    "-" if np.isnan(number) else f"{float(f'{number:.3g}'):g}" for number in numbers
+                    "-" if np.isnan(number) else format_rounded(number, 3) for number in numbers
                 )
                 p = float(cell["p_value_adjusted"])
                 rows.append(

@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from gyrostab.wording import format_rounded
+
 Status = Literal["observed", "upper_limit_only", "not_observable"]
 Tool = Literal["xyz", "xy", "z"]
 
@@ -93,8 +95,8 @@ class SurveyModel:
         """Return the terms as an aligned table, followed by the remarks."""
         rows = [("term", "1 sigma", "5 % to 95 %", "unit", "mode", "propagation", "from")]
         for term in self.terms:
-            value = f"{'< ' * (term.status == 'upper_limit_only')}{term.value:.3g}"
-            spread = f"{term.low:.3g} to {term.high:.3g}"
+            value = f"{'< ' * (term.status == 'upper_limit_only')}{format_rounded(term.value, 3)}"
+            spread = f"{format_rounded(term.low, 3)} to {format_rounded(term.high, 3)}"
             numbers = (value, spread if term.status == "observed" else "")
             rows.append(
                 (term.code, *(numbers if term.value >= 0.0 else ("-", "")), term.unit, term.mode,

@@ -32,6 +32,7 @@ from gyrostab.store.output import new_output
 from gyrostab.store.remote import find_url, upload_file
 from gyrostab.time.durations import format_duration
 from gyrostab.units import HOUR
+from gyrostab.wording import format_rounded
 
 _PANEL_MM = 45.0
 _MAX_CHANCE = 0.05  # probability that chance alone shows any trend
@@ -201,10 +202,10 @@ def _describe_term(row: Mapping[Any, Any], term: str, axes: list[str]) -> dict[s
     for axis in axes:
         value, limit = (row.get(_column_name(term, axis, kind), np.nan) for kind in ("", "_upper"))
         if np.isfinite(value):
-            texts.append(f"{value:.3g}")
+            texts.append(format_rounded(value, 3))
             values.append(float(value))
         else:
-            texts.append(f"< {float(f'{limit:.2g}'):g}" if np.isfinite(limit) else "–")
+            texts.append(f"< {format_rounded(limit)}" if np.isfinite(limit) else "–")
     return {"text": " / ".join(texts), "value": max(values)}
 
 

@@ -19,7 +19,7 @@ from gyrostab.report.product_charts import product_charts, window_data
 from gyrostab.schema import GAP_CAUSES, check_product, describe_times, texts, with_axis
 from gyrostab.store.output import new_output
 from gyrostab.time.durations import format_duration
-from gyrostab.wording import format_share
+from gyrostab.wording import format_rounded, format_share
 
 if TYPE_CHECKING:
     from gyrostab.allan.summary import TermSummary
@@ -128,7 +128,7 @@ def _record_span(product: xr.Dataset) -> tuple[Any, Any]:
 
 
 def _number_text(value: float) -> str:
-    return "–" if not np.isfinite(value) else f"{value:.3g}"
+    return "–" if not np.isfinite(value) else format_rounded(value, 3)
 
 
 def _missing_shares(product: xr.Dataset) -> dict[str, float]:

@@ -9,12 +9,14 @@ from html.parser import HTMLParser
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 from gyrostab.allan.fit import fit_noise
 from gyrostab.errors import OutputError, SchemaError
 from gyrostab.io.datasets import to_netcdf
 from gyrostab.io.opening import open_log, open_product
 from gyrostab.report import write_report
+from gyrostab.schema import OBSERVABLE
 from tests.support import synthetic
 
 
@@ -183,3 +185,13 @@ def test_product_of_an_earlier_version_has_a_report(tmp_path):
     assert "record" in page.ids
     with pytest.raises(SchemaError, match="window_trend"):
         fit_noise(old)
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_large_coefficients_are_written_out(tmp_path):
+    product = synthetic.product(axes="x")
+    product["R"] = xr.full_like(product["R"], 3371.0)
+    product["observable"].loc[{"term": "R"}] = OBSERVABLE.index("observed")
+    text = read(write_report(product, tmp_path / "report.html")).text
+    assert "R = 3370 deg/h²" in text
+    assert "3.37e+03" not in text

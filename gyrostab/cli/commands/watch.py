@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from gyrostab.cli.console import Output, app
 from gyrostab.cli.options import Common, Fitting, Reading, Windowing, whole_number
+from gyrostab.wording import format_rounded
 
 if TYPE_CHECKING:
     from gyrostab.jobs.alarms import Alarm
@@ -137,8 +138,8 @@ def _format_window(window: Mapping[str, Any]) -> str:
         for name, value in values.items():
             limit = values.get(f"{name}_upper")
             if value is not None and not name.endswith("_upper"):
-                shown.append(f"{name} {value:.3g}{'%' if name == 'loss' else ''}")
+                shown.append(f"{name} {format_rounded(value, 3)}{'%' if name == 'loss' else ''}")
             elif limit is not None:
-                shown.append(f"{name} <{limit:.3g}")
+                shown.append(f"{name} <{format_rounded(limit, 3)}")
         axes.append(f"{axis}: {' '.join(shown)}")
     return "  ".join([window["time"][:19], *axes])
