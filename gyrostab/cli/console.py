@@ -34,6 +34,7 @@ from gyrostab.errors import SYSTEM_ERRNOS, GyrostabError, OptionError
 Logs = Annotated[list[Path], Parameter(name="LOG...", negative=())]
 Product = Annotated[Path, Parameter(name="PRODUCT")]
 Output = Annotated[Path, Parameter(name=["--output", "-o"], metavar="FILE")]
+OutputFolder = Annotated[Path, Parameter(name=["--output", "-o"], metavar="DIR")]
 
 app = App(
     name="gyrostab",

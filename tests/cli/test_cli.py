@@ -258,6 +258,14 @@ def test_help_of_a_command_has_an_example_that_parses(command, capsys):
     app[command].parse_args(example.group().split()[2:], exit_on_error=False, print_error=False)
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_calls_an_output_a_folder_if_it_is_one(command, capsys):
+    assert call(command, "--help") == 0
+    text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
+    for kind, meaning in re.findall(r"--output -o (\S+) (\w+)", text):
+        assert (kind == "DIR") == (meaning == "Folder")
+
+
 def test_doctor_describes_the_installation(capsys, monkeypatch):
     assert call("doctor") == 0
     shown = capsys.readouterr().out

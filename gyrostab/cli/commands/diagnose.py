@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from gyrostab.cli.console import app, show_stages
+from gyrostab.cli.console import OutputFolder, app, show_stages
 from gyrostab.cli.options import Common, Reading, whole_number
 
 
@@ -17,7 +17,7 @@ def diagnose(
     recording: Annotated[list[Path], Parameter(name="RECORDING...", negative=())],
     /,
     *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"], metavar="DIR")] = Path("diagnosis"),
+    output: OutputFolder = Path("diagnosis"),
     simulation: Annotated[Path | None, Parameter(metavar="MODEL.toml|SIM.nc")] = None,
     quiet: Annotated[list[str] | None, Parameter(metavar="START/END", negative=())] = None,
     block: Annotated[str | None, Parameter(metavar="DURATION")] = None,

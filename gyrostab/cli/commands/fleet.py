@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from gyrostab.cli.console import Output, app, show_stages
+from gyrostab.cli.console import Output, OutputFolder, app, show_stages
 from gyrostab.cli.options import Common, Fitting, Reading, Windowing
 from gyrostab.store.remote import find_url
 from gyrostab.wording import list_some
@@ -68,7 +68,7 @@ def fleet(
     archive: Archives,
     /,
     *,
-    output: Output,
+    output: OutputFolder,
     per: Literal["folder", "file"] = "folder",
     tool: Annotated[str | None, Parameter(metavar="REGEX")] = None,
     reports: bool = True,

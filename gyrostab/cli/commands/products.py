@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from gyrostab.cli.console import Output, Product, app, show_stages
+from gyrostab.cli.console import Output, OutputFolder, Product, app, show_stages
 from gyrostab.cli.options import ChannelFile, Common, Survey
 from gyrostab.errors import OptionError
 
@@ -132,7 +132,7 @@ def plot(
     product: Product,
     /,
     *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"], metavar="DIR")],
+    output: OutputFolder,
     width: Annotated[float, Parameter(metavar="MM")] = 180.0,
     common: Common = Common(),
 ) -> None:

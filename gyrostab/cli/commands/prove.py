@@ -8,14 +8,14 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from gyrostab.cli.console import app, show_stages
+from gyrostab.cli.console import OutputFolder, app, show_stages
 from gyrostab.cli.options import Common, Flag, whole_number
 
 
 @app.command(sort_key=14, help_epilogue="")
 def prove(
     *,
-    output: Annotated[Path, Parameter(name=["--output", "-o"], metavar="DIR")] = Path("proof"),
+    output: OutputFolder = Path("proof"),
     cases: Annotated[int | None, whole_number(1)] = None,
     seed: Annotated[int | None, whole_number(0)] = None,
     nulls: Annotated[int | None, whole_number(100)] = None,

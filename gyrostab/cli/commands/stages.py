@@ -7,12 +7,12 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from gyrostab.cli.console import Logs, Output, app, show_stages
+from gyrostab.cli.console import Logs, Output, OutputFolder, app, show_stages
 from gyrostab.cli.options import Common, Fitting, Flag, Reading, Running, Windowing
 
 
 @app.command(sort_key=0, help_epilogue="")
-def demo(*, output: Output = Path("gyrostab-demo"), common: Common = Common()) -> None:
+def demo(*, output: OutputFolder = Path("gyrostab-demo"), common: Common = Common()) -> None:
     """Run the whole analysis on the log shipped with gyrostab, a simulated day.
 
     Writes the product, the log, a report and figures to a folder, and prints the noise coefficients
