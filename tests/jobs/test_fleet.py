@@ -400,14 +400,16 @@ def test_a_table_of_files_takes_the_place_of_the_archive(archive, tmp_path, monk
 @pytest.mark.parametrize("window", ["1min", "1h"])  # 1h is longer than the record: the run fails
 def test_files_that_are_not_read_are_named(tmp_path, capsys, window):
     write_log(tmp_path / "runs" / "log.nc", 5)
-    (tmp_path / "runs" / "raw.csv").write_text("time [s],wx\n0,1\n1,2\n2,3\n")
+    (tmp_path / "runs" / "a").mkdir()
+    (tmp_path / "runs" / "a" / "raw.csv").write_text("time [s],wx\n0,1\n1,2\n2,3\n")
     output = tmp_path / "fleet"
     options = ["--window", window, "--no-reports", "--scheduler", "threads", "--quiet-progress"]
     fails = window == "1h"
     assert main(["fleet", str(tmp_path / "runs"), "-o", str(output), *options]) == 2 * fails
     printed = capsys.readouterr()
     assert printed.out.startswith("1 run of 1 tool\n") == (not fails)
-    assert "1 of 2 files are logs\nnote: not logs, or not without options: raw.csv;" in printed.err
+    assert "1 of 2 files are logs\nnote: not logs, or not" in printed.err
+    assert "without options: a/raw.csv;" in printed.err
     notes = read_table(output / "files.parquet", content="files").set_index("format")["note"]
     assert "no gyro column" in notes["text"]
 

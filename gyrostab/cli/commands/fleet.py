@@ -145,7 +145,12 @@ def _print_left_out(table: pd.DataFrame, path: Path) -> None:
     print(f"{int(table['is_log'].sum())} of {len(table)} files are logs", file=sys.stderr)
     left_out: Any = table[~table["is_log"].astype(bool) & (table["format"] != "diagnosis")]
     if len(left_out):
-        names = list_some([Path(name).name for name in left_out["file"]])
+        names = list_some(
+            [
+                file.removeprefix(base).lstrip("/") or file
+                for file, base in zip(left_out["file"], left_out["base"], strict=True)
+            ]
+        )
         print(
             f"note: not logs, or not without options: {names}; {find_url(path) or path} lists "
             "them with the reasons, and gyrostab scan FILE prints the options that a file needs",
