@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from typing import NamedTuple
@@ -65,14 +65,15 @@ def find_late_channel(
         int(examination.settings.max_delay_s / block_s), blocks.sizes["block"] // _MIN_RECORD_DELAYS
     )
     on_time = {name for effect in identifications.identified for name in effect.driver}
-    channels = [name for name in channel_units(blocks) if name not in on_time | {*moved}]
-    if not unexplained or reach == 0 or not channels:
+    names = [name for name in channel_units(blocks) if name not in on_time | {*moved}]
+    if not unexplained or reach == 0 or not names:
         return None
     explained = [effect for effect in identifications.identified if effect not in unexplained]
-    search = DelaySearch(examination, examination.state_with(explained), baseline, log, reach)
-    best = search.find_best(channels)
+    channels = {name: split_channel(name, log, blocks) for name in names}
+    search = DelaySearch(examination, examination.state_with(explained), baseline, channels, reach)
+    best = search.find_best()
     count = 2 * reach * len(channels)
-    on_time_nats = float(search.evidence(best.channel, search.parts(best.channel), [0])[0])
+    on_time_nats = float(search.evidence(best.channel, [0])[0])
     needed_nats = max(examination.threshold, on_time_nats) + math.log(_PARTS * count)
     if best.nats <= needed_nats:
         return None
@@ -124,27 +125,25 @@ class DelaySearch:
     examination: Examination
     state: State  # with the effects that are explained
     baseline: xr.Dataset
-    log: xr.Dataset
+    channels: Mapping[str, Floats]  # in parts of the blocks, as `split_channel` returns them
     reach: int  # blocks in the largest delay of a clock
 
-    def find_best(self, channels: Iterable[str]) -> Delay:
+    def find_best(self) -> Delay:
         """Return the delay of whole blocks with the most evidence, of any channel."""
         shifts = _PARTS * np.delete(np.arange(-self.reach, self.reach + 1), self.reach)
         return max(
             Delay(float(nats), int(shift), channel)
-            for channel in channels
-            for shift, nats in zip(
-                shifts, self.evidence(channel, self.parts(channel), shifts), strict=True
-            )
+            for channel in self.channels
+            for shift, nats in zip(shifts, self.evidence(channel, shifts), strict=True)
         )
 
     def refine(self, best: Delay) -> Delay:
         """Return the best delay near another one, to a part of a block."""
-        parts, step = self.parts(best.channel), _PARTS
+        step = _PARTS
         while step > 1:
             step //= 2
             shifts = best.parts + step * np.arange(-1, 2)
-            nats = self.evidence(best.channel, parts, shifts)
+            nats = self.evidence(best.channel, shifts)
             best = best._replace(nats=float(nats.max()), parts=int(shifts[nats.argmax()]))
         return best
 
@@ -154,48 +153,31 @@ class DelaySearch:
         False if the channel resembles itself at most of them.
         """
         settings = self.examination.settings
-        parts = self.parts(best.channel)
+        parts = self.channels[best.channel]
         shifts = _PARTS * np.arange(self.reach, parts.size // _PARTS - self.reach + 1)
         shifts = shifts[np.abs(_correlate_with_itself(parts, shifts)) <= settings.majority_share]
         if shifts.size < settings.min_surrogates:
             return False
         number = min(shifts.size, _MAX_OTHER_DELAYS)
         shifts = shifts[np.linspace(0, shifts.size - 1, number).astype(int)]
-        nats = self.evidence(best.channel, parts, best.parts + shifts, wrap=True).max()
+        nats = self.evidence(best.channel, best.parts + shifts, wrap=True).max()
         ratio = best.nats / max(float(nats), 1.0)
         return chance_of_best(ratio, count, number) <= settings.surrogate_share
 
-    def parts(self, channel: str) -> Floats:
-        """Return the channel in parts of the blocks; the mean square where the rms matters."""
-        blocks = self.examination.start.blocks
-        count, samples = blocks.sizes["block"], int(blocks.attrs["block_samples"])
-        edges = grid_times(
-            int(blocks.attrs["start_ns"]),
-            float(blocks.attrs["sampling_rate_hz"]),
-            np.arange(count * _PARTS + 1) * samples // _PARTS,
-        )
-        with_stamps = move_channels(self.log, {channel: 0.0})
-        means = channel_means(with_stamps, channel, edges, rms=is_rms_channel(channel))
-        return means**2 if is_rms_channel(channel) else means
-
-    def evidence(
-        self, channel: str, parts: Floats, shifts: Iterable[int], *, wrap: bool = False
-    ) -> Floats:
+    def evidence(self, channel: str, shifts: Iterable[int], *, wrap: bool = False) -> Floats:
         """Return the evidence of the effect that follows a channel best, moved by parts [nats].
 
         With `wrap`, the channel moves round the record, end to start.
         """
-        by_shift = [self._find_followers(channel, parts, shift, wrap=wrap) for shift in shifts]
+        by_shift = [self._find_followers(channel, shift, wrap=wrap) for shift in shifts]
         owner = {
-            id(candidate): place
-            for place, followers in enumerate(by_shift)
-            for candidate in followers
+            candidate: place for place, followers in enumerate(by_shift) for candidate in followers
         }
         settings = self.state.settings
         grouped: list[list[CandidateEvidence]] = [[] for _ in by_shift]
         # of all shifts together, so that the noise is whitened once for many designs
         for evidence in self.examination.compute_evidence(list(chain(*by_shift)), self.state):
-            grouped[owner[id(evidence.candidate)]].append(evidence)
+            grouped[owner[evidence.candidate]].append(evidence)
         return np.array(
             [
                 max(
@@ -206,10 +188,9 @@ class DelaySearch:
             ]
         )
 
-    def _find_followers(
-        self, channel: str, parts: Floats, shift: int, *, wrap: bool
-    ) -> list[Candidate]:
+    def _find_followers(self, channel: str, shift: int, *, wrap: bool) -> list[Candidate]:
         """Return the candidates in means and powers that follow a channel moved by parts."""
+        parts = self.channels[channel]
         blocks = self.examination.start.blocks.drop_vars(f"fine_{channel}", errors="ignore")
         places = np.arange(parts.size) + shift
         if wrap:
@@ -232,6 +213,19 @@ class DelaySearch:
             for candidate in candidates
             if candidate.statistic.is_linear_in_means or candidate.statistic.is_power
         ]
+
+
+def split_channel(channel: str, log: xr.Dataset, blocks: xr.Dataset) -> Floats:
+    """Return a channel in parts of the blocks; the mean square where the rms matters."""
+    count, samples = blocks.sizes["block"], int(blocks.attrs["block_samples"])
+    edges = grid_times(
+        int(blocks.attrs["start_ns"]),
+        float(blocks.attrs["sampling_rate_hz"]),
+        np.arange(count * _PARTS + 1) * samples // _PARTS,
+    )
+    with_stamps = move_channels(log, {channel: 0.0})
+    means = channel_means(with_stamps, channel, edges, rms=is_rms_channel(channel))
+    return means**2 if is_rms_channel(channel) else means
 
 
 def _correlate_with_itself(parts: Floats, shifts: Ints) -> Floats:
