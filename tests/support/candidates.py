@@ -64,7 +64,7 @@ def make_identifications(
         null_best=np.zeros(1),
         reasons=dict(reasons or {}),
     )
-    return Identifications(examination, tuple(identified), (), state, tuple(candidates))  # type: ignore[arg-type]
+    return Identifications(examination, tuple(identified), (), state)  # type: ignore[arg-type]
 
 
 def identify_by_hand(

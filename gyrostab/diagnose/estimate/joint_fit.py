@@ -269,9 +269,7 @@ def _estimate_sizes(
     identifications: Identifications,
 ) -> tuple[Sizes, Mapping[str, float | str]]:
     """Return parameters with their errors from components in one statistic, and likely values."""
-    # a step has its own grid of times, which ends where those of other steps begin
-    candidates = () if components[0].is_step else identifications.candidates
-    fit = SizeFit(components, axes, state, candidates, identifications.examination.count_evidence)
+    fit = SizeFit(components, axes, state, identifications.examination.count_evidence)
     return components[0].statistic.estimate(fit), fit.likeliest
 
 

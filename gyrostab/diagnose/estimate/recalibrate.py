@@ -375,7 +375,4 @@ def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identi
             replace(identification, components=tuple(map(renew, identification.components)))
             for identification in identifications.identified
         ),
-        candidates=tuple(
-            candidates.get(candidate, candidate) for candidate in identifications.candidates
-        ),
     )

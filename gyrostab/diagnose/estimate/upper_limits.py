@@ -47,7 +47,7 @@ def _limit_effect(kind: type[Effect], identifications: Identifications) -> dict[
         return {"upper_limit": math.nan, "unit": unit, "reason": reason}
     limits = [
         _limit_candidate(candidate, identifications.state)
-        for candidate in identifications.candidates
+        for candidate in identifications.examination.candidates
         if candidate.effect == kind.name
         and candidate.statistic.has_course
         and candidate.statistic.has_size

@@ -11,7 +11,7 @@ import xarray as xr
 from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.predict.average_sizes import Point, choose_grid, refine_grid
-from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
+from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.registry import effects
@@ -32,8 +32,7 @@ def choose_forms(identifications: Identifications, baseline: xr.Dataset) -> Iden
         return replace(
             identification,
             components=tuple(
-                _choose_variant(prefer_plainer(component, state), state, identifications.candidates)
-                for component in components
+                _choose_variant(prefer_plainer(component, state), state) for component in components
             ),
         )
 
@@ -91,13 +90,11 @@ def _select_texts(component: Component, state: State, texts: Mapping[str, str]) 
     )
 
 
-def _choose_variant(
-    component: Component, state: State, candidates: Sequence[Candidate]
-) -> Component:
+def _choose_variant(component: Component, state: State) -> Component:
     """Return a component in its own variant, or in the best of those that its sizes are from."""
     if component.is_filter or component.is_step or not _has_forms(component):
         return component
-    grid = choose_grid(component, state, candidates)
+    grid = choose_grid(component, state)
     if any(point.variant is component.variant for point in grid):
         return component
     return replace(component, variant=max(grid, key=lambda point: point.evidence).variant)

@@ -63,7 +63,6 @@ def identify_effects(examination: Examination) -> Identifications:
         tuple(sorted(remaining, key=lambda identification: -identification.evidence_nats)),
         tuple(unidentified),
         examination.state_with([*remaining, *unidentified]),
-        tuple(examination.candidates),
         examination.expected,
         beaten,
     )

@@ -9,7 +9,6 @@ import xarray as xr
 
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.selections import Selection, condition_on_selections
-from gyrostab.diagnose.predict.candidates import Candidate
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 
 
@@ -21,7 +20,6 @@ class Identifications:
     identified: tuple[Selection, ...]  # the strongest first
     unidentified: tuple[Selection, ...]
     state: State  # with all of the above, and the expected effects, in the model
-    candidates: tuple[Candidate, ...]  # all that were tried, for the noise of the state
     #: Effects that the simulation contains as well, with size and time from the recording.
     expected: tuple[Selection, ...] = ()
     #: Key of each candidate that passed the threshold and was not selected -> another form or a

@@ -15,7 +15,7 @@ import numpy as np
 
 from gyrostab.arrays import Floats
 from gyrostab.diagnose.evidence.mixture import Mixture
-from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
+from gyrostab.diagnose.predict.candidates import TIME_PARAMETER, Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.predict.windows import rebuild_variant
@@ -61,18 +61,15 @@ class AveragedSizes(NamedTuple):
     likeliest_variant: Variant
 
 
-def average_sizes(
-    component: Component, state: State, candidates: Sequence[Candidate]
-) -> AveragedSizes:
+def average_sizes(component: Component, state: State) -> AveragedSizes:
     """Return the sizes of a component, averaged over the noise and the nuisance parameters.
 
     Exponents have their defaults and lags are zero unless other values are better by 3 nats and an
     error of the form. The scatter of the sizes includes all lags that the record allows, even when
     the lag is given as zero. Exponents are not averaged over, because each gives the size another
-    unit. The state has all other effects in the model, and the candidates are all that were tried;
-    they have the grid.
+    unit. The state has all other effects in the model.
     """
-    points = refine_grid(component, state, choose_grid(component, state, candidates))
+    points = refine_grid(component, state, choose_grid(component, state))
     family = [point.variant for point in points]
     evidence = np.array([point.evidence for point in points])
     merged = _merge_points(points)
@@ -129,16 +126,13 @@ def _average_nuisance(
     return nuisance
 
 
-def choose_grid(component: Component, state: State, candidates: Sequence[Candidate]) -> list[Point]:
+def choose_grid(component: Component, state: State) -> list[Point]:
     """Return the grid that the sizes of a component are averaged over.
 
     It has the plain variants alone (`plain_places`), unless others are clearly better.
     """
-    grid = [
-        Point(variant, component_mixture(component, state, variant))
-        for variant in _variant_family(component, candidates)
-    ]
-    family = [point.variant for point in grid]
+    family = component.candidate.family(component.variant)
+    grid = [Point(variant, component_mixture(component, state, variant)) for variant in family]
     plain = [grid[place] for place in plain_places(component.candidate.effect, family)]
     top = max(point.evidence for point in grid)
     is_plain = any(point.evidence > top - state.settings.ambiguous_nats for point in plain)
@@ -177,20 +171,6 @@ def _merge_points(points: Sequence[Point]) -> Mixture:
             for name in ("log_weight", "mean", "covariance")
         )
     )
-
-
-def _variant_family(component: Component, candidates: Sequence[Candidate]) -> list[Variant]:
-    """Return the variants of the component with the same columns and texts: the grid."""
-    candidate = next(
-        (
-            candidate
-            for candidate in candidates
-            if candidate.key == component.candidate.key
-            and candidate.statistic is component.statistic
-        ),
-        component.candidate,
-    )
-    return candidate.family(component.variant)
 
 
 def plain_places(effect: str, family: Sequence[Variant]) -> list[int]:

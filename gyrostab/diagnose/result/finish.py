@@ -69,7 +69,7 @@ def finish_diagnosis(
     # channels that an effect could follow, or was compared with
     used = {
         name
-        for candidate in fit.identifications.candidates
+        for candidate in fit.identifications.examination.candidates
         for name in (*candidate.driver, *candidate.reference)
     }
     content = {

@@ -74,8 +74,6 @@ class SizeFit:
     components: Sequence[Component]  # of one effect, all in one statistic
     axes: tuple[str, ...]
     state: State  # with all other effects in the model
-    #: All that were tried; they have the grids of nuisance parameters.
-    candidates: Sequence[Candidate]
     count_evidence: CountEvidence  # expected sample counts
     #: Filled by an estimate that averages over a grid: the values at its likeliest point.
     likeliest: dict[str, float | str] = field(default_factory=dict)
@@ -293,7 +291,7 @@ class Statistic:
         for component in sorted(fit.components, key=lambda component: component.evidence_nats):
             if component.variant.columns[:1] == ("any",):
                 continue
-            averaged = average_sizes(component, fit.state, fit.candidates)
+            averaged = average_sizes(component, fit.state)
             for number, name in enumerate(component.variant.columns):
                 value = float(averaged.mean[number])
                 sd = float(np.sqrt(averaged.covariance[number, number]))

@@ -128,13 +128,9 @@ def test_limit_of_an_effect_slower_than_the_grid():
     blocks = record([], environment=environment)
     baseline = calibrate_noise(blocks)
     frame = joint_fit.identify_by_hand(blocks, baseline, "shupe", "mean", ("sensitivity",))
-    frame = replace(
-        frame,
-        identified=(),
-        candidates=tuple(
-            candidate for candidate in frame.candidates if candidate.effect == "shupe"
-        ),
-    )
+    tried = [candidate for candidate in frame.examination.candidates if candidate.effect == "shupe"]
+    examination = replace(frame.examination, candidates=tried)
+    frame = replace(frame, identified=(), examination=examination)
     rng = np.random.default_rng(8)
     drawn = next(null_records(blocks, baseline, count=RECORDS, rng=rng, chunk=RECORDS))
     means = average_blocks(size * filter_slowly(60.0 * np.gradient(heat), time))

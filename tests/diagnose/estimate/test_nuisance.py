@@ -24,16 +24,10 @@ def noise_only():
     return blocks, calibrate_noise(blocks)
 
 
-def _variant(identifications, component, values):
-    candidate = next(
-        candidate
-        for candidate in identifications.candidates
-        if candidate.key == component.candidate.key
-        and candidate.statistic == component.candidate.statistic
-    )
+def _variant(component, values):
     return next(
         variant
-        for variant in candidate.variants
+        for variant in component.candidate.variants
         if variant.columns == component.variant.columns
         and all(
             variant.values[name] == pytest.approx(value, rel=0.01) for name, value in values.items()
@@ -46,11 +40,11 @@ def fit_effect(noise_only, effect, statistic, column, *, true, size, named):
     blocks, baseline = noise_only
     identifications = identify_by_hand(blocks, baseline, effect, statistic, (column,))
     component = identifications.identified[0].components[0]
-    design = _variant(identifications, component, true).design
+    design = _variant(component, true).design
     size = size if statistic == "mean" else size**2
     added = size * np.stack([design[0, 0], 0 * design[0, 0], 0 * design[0, 0]])
     changed = blocks.assign({statistic: blocks[statistic] + added})
-    component = replace(component, variant=_variant(identifications, component, named))
+    component = replace(component, variant=_variant(component, named))
     identification = replace(identifications.identified[0], components=(component,))
     state = condition_on(initial_state(changed, baseline), [component])
     (fitted,) = fit_identifications(

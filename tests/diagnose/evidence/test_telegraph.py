@@ -211,7 +211,7 @@ def test_sizes_match_those_of_the_course() -> None:
     course = telegraph_share(rng, 100.0, 200.0)
     state = state_of(0.5 * course + white(rng, 1)[0])
     shown = component(state, course)
-    sizes = shown.statistic.estimate(SizeFit([shown], ("x",), state, [], CountEvidence({})))
+    sizes = shown.statistic.estimate(SizeFit([shown], ("x",), state, CountEvidence({})))
     value, error = sizes["step"]
     assert abs(value - 0.5) < 4.0 * error
     assert 0.015 < error < 0.06  # twice the error of a mean over all blocks

@@ -77,8 +77,8 @@ def test_null_records_may_come_in_parts():
 @pytest.mark.full
 def test_evidence_does_not_depend_on_the_parts_of_a_group(shaken, monkeypatch):
     state = shaken.state
-    candidates = [item for item in shaken.candidates if item.statistic.null_variable]
-    arguments = candidates, state.blocks, state, fold_blocks(state.blocks)
+    candidates = [item for item in shaken.examination.candidates if item.statistic.null_variable]
+    arguments = candidates, state.blocks, state
     whole = compute_evidence(*arguments)
     monkeypatch.setattr(search, "_COLUMNS_AT_ONCE", 20)
     parts = compute_evidence(*arguments)
@@ -130,7 +130,7 @@ def test_chance_on_another_axis_does_not_veto_an_effect(shaken, monkeypatch):
 
 def test_sizes_outside_the_registry_are_rejected(shaken):
     """1e4 deg/h per degree is that of a broken instrument, or not an effect of temperature."""
-    bias = select_candidate(shaken.candidates, "temperature_bias", "mean")
+    bias = select_candidate(shaken.examination.candidates, "temperature_bias", "mean")
     variant = next(variant for variant in bias.variants if variant.columns == ("sensitivity",))
     component = Component(bias, variant, ("y",), 50.0)
     for size, answer in ((5e3, [component]), (1.5e4, [])):
@@ -243,12 +243,12 @@ def test_two_effects_are_both_identified():
 
 def test_time_shifted_channels_explain_less(shaken):
     (identification,) = shaken.identified
-    start, folds = replace(shaken.state, given={}), fold_blocks(shaken.state.blocks)
-    beats, p_value, _ = passes_time_shift_test(identification.components, start, folds)
+    start = replace(shaken.state, given={})
+    beats, p_value, _ = passes_time_shift_test(identification.components, start)
     assert beats
     assert p_value <= 0.01
     elsewhere = [replace(component, row=("z",)) for component in identification.components]
-    assert not passes_time_shift_test(elsewhere, start, folds)[0]
+    assert not passes_time_shift_test(elsewhere, start)[0]
 
 
 def test_identified_effect_is_in_the_model_of_the_next(shaken):

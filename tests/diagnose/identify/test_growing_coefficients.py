@@ -140,7 +140,7 @@ def identifications(
     null = np.sort(np.random.default_rng(1).exponential(1.0, 400))
     state: Any = SimpleNamespace(settings=DEFAULTS)
     examination: Any = SimpleNamespace(null_best=null)
-    return Identifications(examination, (identification,), (), state, ())
+    return Identifications(examination, (identification,), (), state)
 
 
 def blocks() -> xr.Dataset:

@@ -55,7 +55,7 @@ def test_time_of_a_jump_is_that_of_the_axis_that_shows_it_best():
     jumps, state = try_jumps(blocks, calibrate_noise(blocks, quiet=(0, 250)))
     (components,) = find_components([jumps], state).values()
     assert components[0].evidence_nats > components[1].evidence_nats + 100.0
-    fit = SizeFit(components, ("x", "y"), state, (), CountEvidence({}))
+    fit = SizeFit(components, ("x", "y"), state, CountEvidence({}))
     at, error, *_ = jumps.statistic.estimate(fit)["at"]
     assert at == pytest.approx(300.0, abs=5.0)
     assert error < 5.0
