@@ -34,7 +34,6 @@ SUPPORT_TAIL = 0.1 * INTERVAL_TAILS[0]
 _SECONDS = {"s": 1.0, "h": HOUR}
 #: Units of parameters that have values between those of the grid.
 _SCALES = (*_SECONDS, "degC")
-_INSTANT = "at"  # a parameter in seconds whose grid is fine already
 # Tolerances of the quadrature over the grid.
 LIKELY_NATS = 6.0  # below the best, to which points count: a probability of 1 in 400
 STEEP_NATS = 1.0  # from one point to the next, that the quadrature tolerates
@@ -295,7 +294,8 @@ def _find_scale(component: Component, points: Sequence[Point]) -> tuple[str, str
     units = {item.name: item.unit for item in parameters}
     for name in points[0].variant.values:
         values = {point.variant.values.get(name) for point in points}
-        if len(values) > 2 and units.get(name) in _SCALES and name != _INSTANT:
+        # the grid of instants is fine already
+        if len(values) > 2 and units.get(name) in _SCALES and name != TIME_PARAMETER:
             return name, units[name]
     return None
 
