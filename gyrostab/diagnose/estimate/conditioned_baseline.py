@@ -61,14 +61,12 @@ def predict_baseline(
         in common, and ``shape_factor`` (band,) on the degrees of freedom behind a filter.
     """
     blocks = identifications.state.blocks
-    keep = (
-        np.ones(blocks.sizes["block"], np.bool_)
-        if training is None
-        else np.asarray(training, np.bool_)
-    )
-    usable_blocks = blocks.copy()
-    for name in ("mean", "power", "cross"):
-        usable_blocks[name] = usable_blocks[name].where(xr.DataArray(keep, dims="block"))
+    usable_blocks = blocks
+    if training is not None:
+        keep = xr.DataArray(training, dims="block")
+        usable_blocks = blocks.assign(
+            {name: blocks[name].where(keep) for name in ("mean", "power", "cross")}
+        )
     state = initial_state(usable_blocks, baseline, settings=identifications.state.settings)
     # for each column in the model, whether it belongs to an effect that is left out
     is_left_out: dict[tuple[str, str], list[bool]] = {}

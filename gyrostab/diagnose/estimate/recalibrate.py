@@ -78,11 +78,7 @@ def recalibrate(
     if baseline.attrs.get("source") != "calibrated" or not identifications.identified:
         return baseline
     blocks = identifications.state.blocks
-    use = (
-        np.ones(blocks.sizes["block"], np.bool_)
-        if training is None
-        else np.asarray(training, np.bool_)
-    )
+    use = True if training is None else training
     state = condition_on_selections(
         identifications.state_without_effects(baseline), identifications.identified
     )
@@ -100,7 +96,7 @@ def recalibrate(
             has_unidentified = any(
                 axis in selection.axes for selection in identifications.unidentified
             )
-            chosen = use & ~state.masked[row] & (quiescent[row] if has_unidentified else True)
+            chosen = ~state.masked[row] & use & (quiescent[row] if has_unidentified else True)
             wander = expected_processes(with_processes, row)
             posterior = _fit_noise(state, row, axis_effects, chosen, wander)
             if posterior is not None:
