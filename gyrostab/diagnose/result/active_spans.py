@@ -54,6 +54,14 @@ def _rest_level(size: Floats, settings: Settings) -> Floats:
     return np.where(still.mean(axis=0) >= settings.rest_share, 0.0, np.median(size, axis=0))
 
 
+def active_spans(
+    identification: Selection, blocks: xr.Dataset, *, settings: Settings = DEFAULTS
+) -> list[tuple[float, float]]:
+    """Return the stretches of time [s] in which an effect acts."""
+    acting = active_blocks(identification, blocks, settings=settings)
+    return join_blocks(acting, blocks["begin"].values, blocks["end"].values)
+
+
 def join_blocks(is_inside: Bools, begin: Floats, end: Floats) -> list[tuple[float, float]]:
     """Join blocks to stretches of time [s], with short pauses bridged.
 

@@ -20,7 +20,7 @@ from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import drop_changed_tails, find_bands, mean_columns
 from gyrostab.diagnose.predict.linear_model import pair_rows
 from gyrostab.diagnose.reduce.schema import weighted_mean
-from gyrostab.diagnose.result.active_spans import active_blocks, join_blocks
+from gyrostab.diagnose.result.active_spans import active_spans
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS, find_statistic
 from gyrostab.diagnose.statistics.base import Region
@@ -216,10 +216,9 @@ def _explained_spans(
 
     A line locked to the rotation also shows in parts that rotate only a little.
     """
-    begin, end = blocks["begin"].values, blocks["end"].values
     if any(component.statistic.is_rotation for component in identification.components):
-        return [(float(begin[0]), float(end[-1]))]
-    return join_blocks(active_blocks(identification, blocks, settings=settings), begin, end)
+        return [(float(blocks["begin"].values[0]), float(blocks["end"].values[-1]))]
+    return active_spans(identification, blocks, settings=settings)
 
 
 def _overlap_seconds(region: Region, span: tuple[float, float]) -> float:

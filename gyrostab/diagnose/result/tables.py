@@ -23,7 +23,7 @@ from gyrostab.diagnose.nulls.scores import MIN_P_VALUE, fit_best_evidence
 from gyrostab.diagnose.predict.candidates import NUISANCE_ALTERNATIVES
 from gyrostab.diagnose.predict.windows import channel_units, make_windows
 from gyrostab.diagnose.reduce.schema import format_time, read_as_measured
-from gyrostab.diagnose.result.active_spans import active_blocks, join_blocks
+from gyrostab.diagnose.result.active_spans import active_spans
 from gyrostab.diagnose.result.diagnosis import tabulate_effect
 from gyrostab.diagnose.result.families import find_families
 from gyrostab.diagnose.result.text import (
@@ -107,16 +107,14 @@ def effect_tables(
     with the evidence of the whole identification, because that passed the threshold. The standard
     error of a held-out gain is that of a log-likelihood ratio under the right model: sqrt(2 gain).
     """
-    begin, end = blocks["begin"].values, blocks["end"].values
+    record_s = float(blocks["end"].values[-1])
+    whole = [(float(blocks["begin"].values[0]), record_s)]
     out = []
     for fitted_effect, family in zip(fitted, _families_of(fitted, blocks), strict=True):
         identification = fitted_effect.identification
         components = fitted_effect.components or identification.components
-        acting = active_blocks(
-            replace(identification, components=components), blocks, settings=settings
-        )
-        when = join_blocks(acting, begin, end)
-        record_s = float(end[-1])
+        acting = replace(identification, components=components)
+        when = active_spans(acting, blocks, settings=settings)
         out.append(
             {
                 "name": identification.effect,
@@ -140,7 +138,7 @@ def effect_tables(
                     _describe_fitted(fitted_effect, blocks),
                     alternatives=identification.alternatives,
                     intervals=[]
-                    if when == [(float(begin[0]), record_s)]
+                    if when == whole
                     else [span_text(*span, record_s) for span in when],
                 ),
             }
@@ -318,7 +316,7 @@ def identified_mismatches(
     strongest component describes them.
     """
     out: list[dict[str, Any]] = []
-    begin, end = blocks["begin"].values, blocks["end"].values
+    record_s = float(blocks["end"].values[-1])
     settings = identifications.state.settings
     null = fit_best_evidence(identifications.examination.null_best, settings=settings)
     for identification in identifications.identified:
@@ -332,9 +330,8 @@ def identified_mismatches(
         view, axes, names = strongest.statistic.view, identification.axes, [identification.effect]
         taus = strongest.statistic.averaging_times(strongest, blocks)
         p_value = float(null.probability(identification.evidence_nats))
-        acting = active_blocks(identification, blocks, settings=settings)
-        for span in join_blocks(acting, begin, end):
-            when = span_text(*span, float(end[-1]))
+        for span in active_spans(identification, blocks, settings=settings):
+            when = span_text(*span, record_s)
             text = named_statement(view, identification.effect, axes, when, p_value)
             out.append(
                 _make_mismatch(blocks, view, axes, span, taus, p_value, text, explained_by=names)

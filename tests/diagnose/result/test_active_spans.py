@@ -9,7 +9,7 @@ import pytest
 
 from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.predict.candidates import Component
-from gyrostab.diagnose.result.active_spans import active_blocks, join_blocks
+from gyrostab.diagnose.result.active_spans import active_blocks, active_spans
 from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from tests.support.candidates import select_candidate
 from tests.support.named import COEFFICIENT, WORLD, record
@@ -33,11 +33,7 @@ def identification(blocks, effect, statistic):
 
 
 def test_rotation_line_acts_while_the_tool_rotates(turning):
-    intervals = join_blocks(
-        active_blocks(identification(turning, "rotation_line", "rotation_order"), turning),
-        turning["begin"].values,
-        turning["end"].values,
-    )
+    intervals = active_spans(identification(turning, "rotation_line", "rotation_order"), turning)
     assert intervals == [(1200.0, 3600.0)]
 
 
@@ -50,19 +46,13 @@ def test_effect_present_at_rest_acts_at_rest(turning):
             *identification(turning, "earth_rate", "mean").components,
         ),
     )
-    assert join_blocks(
-        active_blocks(combined, turning), turning["begin"].values, turning["end"].values
-    ) == [(0.0, 3600.0)]
+    assert active_spans(combined, turning) == [(0.0, 3600.0)]
 
 
 def test_effect_of_a_mostly_active_channel_acts_while_it_is_active(
     turning,
 ):
-    (span,) = join_blocks(
-        active_blocks(identification(turning, "scale_factor", "mean"), turning),
-        turning["begin"].values,
-        turning["end"].values,
-    )
+    (span,) = active_spans(identification(turning, "scale_factor", "mean"), turning)
     assert span == (1200.0, 3600.0)
 
 
