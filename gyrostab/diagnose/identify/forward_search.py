@@ -91,8 +91,7 @@ def _select_all(examination: Examination) -> tuple[list[Selection], dict[str, tu
         all_evidence = score_candidates(
             examination, state, barred, includes_last_resorts=includes_last_resorts
         )
-        selected = _select_next(examination, all_evidence, state, chosen, beaten)
-        selections, shifted = selected or ([], {})
+        selections, shifted = _select_next(examination, all_evidence, state, chosen, beaten)
         beaten |= shifted
         barred |= shifted.keys()
         if shifted and not selections:
@@ -111,7 +110,7 @@ def _select_all(examination: Examination) -> tuple[list[Selection], dict[str, tu
                 effects_left -= 1
             chosen = add_selection(chosen, selection)
             barred |= _explained_count_keys(examination, selection)
-            state = condition_on(state, list(selection.components))
+            state = condition_on(state, selection.components)
     return chosen, beaten
 
 
@@ -167,7 +166,7 @@ def score_candidates(
         strongest = max(powers, key=_sum_rows, default=None)
         if strongest is None or _sum_rows(strongest) < min_nats:
             break
-        trial = condition_on(state, find_components(strongest, settings=settings))
+        trial = condition_on(state, select_components(strongest, settings))
         weighted_evidence = examination.compute_evidence(
             weighted, replace(state, expected_power=trial.expected_power)
         )
@@ -185,12 +184,12 @@ def _select_next(
     state: State,
     chosen: Sequence[Selection],
     beaten: dict[str, tuple[str, float]],
-) -> tuple[list[Selection], dict[str, tuple[str, float]]] | None:
+) -> tuple[list[Selection], dict[str, tuple[str, float]]]:
     """Select the next effect or pair of effects, or the nuisance alternative that explains more.
 
-    Effects that another form beats are added to `beaten`. Returns the selections, none when only
-    effects passed that fail the time-shift test, and by how much a time-shifted channel explains
-    more than those that fail it; None instead of both when nothing passes.
+    Effects that another form beats are added to `beaten`. The second result is by how much a
+    time-shifted channel explains more than each effect that fails this test; nothing is selected if
+    no effect passes but these.
     """
     settings = examination.settings
     components = merge_lines(group_components(all_evidence, settings=settings))
@@ -201,7 +200,7 @@ def _select_next(
     _leave_out_impossible(components, required, examination, state, chosen, beaten)
     passing = order_passing(components, required, state, examination)
     if not passing:
-        return None
+        return [], {}
     rivals = order_rivals(passing, components, state, examination)
     options = [[(key, components[key], state)] for key in rivals]
     if not rivals:

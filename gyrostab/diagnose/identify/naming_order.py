@@ -119,7 +119,7 @@ def _without_slopes(
     filters = [key for key in passing if any(component.is_filter for component in components[key])]
     if not lines or not filters:
         return passing
-    trial = condition_on(state, list(components[filters[0]]))
+    trial = condition_on(state, components[filters[0]])
     after = examination.find_components([components[key][0].candidate for key in lines], trial)
     real = {
         key

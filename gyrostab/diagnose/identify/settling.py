@@ -144,7 +144,7 @@ def find_instead(
     with the weights that it has with the selection.
     """
     weighted = replace(
-        state, expected_power=condition_on(state, list(selection.components)).expected_power
+        state, expected_power=condition_on(state, selection.components).expected_power
     )
     statistics = {component.statistic for component in selection.components}
     candidates = [

@@ -22,7 +22,7 @@ MIN_FITTED_POWER_RATIO = 0.2
 SCORING_STEPS = 4  # of Fisher scoring, which fits powers
 
 
-def condition_on(state: State, components: list[Component]) -> State:
+def condition_on(state: State, components: Iterable[Component]) -> State:
     """Add an effect to the state and refit the powers."""
     return refit_powers(condition_on_components(state, components))
 

@@ -153,7 +153,10 @@ def test_the_form_that_beats_an_effect_is_recorded():
     examination = _examine(values, 1.0, {}, ("bias_jump",))
     evidence = forward_search.score_candidates(examination, examination.start, ())
     beaten = {}
-    assert forward_search._select_next(examination, evidence, examination.start, [], beaten) is None
+    assert forward_search._select_next(examination, evidence, examination.start, [], beaten) == (
+        [],
+        {},
+    )
     name, nats = beaten["bias_jump"]
     assert name == "a gradual change"
     assert nats > 3.0
@@ -165,7 +168,7 @@ def test_rejected_channels_do_not_use_up_the_number_of_effects(monkeypatch):
     def select_next(*_):
         number = next(rounds)
         failed = {f"channel {number}": ("a time-shifted channel", 1.0)}
-        return ([], failed) if number < 2 * forward_search.MAX_EFFECTS else None
+        return [], failed if number < 2 * forward_search.MAX_EFFECTS else {}
 
     monkeypatch.setattr(forward_search, "_select_next", select_next)
     monkeypatch.setattr(forward_search, "score_candidates", lambda *_, **__: [])
@@ -176,7 +179,7 @@ def test_rejected_channels_do_not_use_up_the_number_of_effects(monkeypatch):
 
 def test_what_fails_the_time_shift_test_is_barred_before_random_biases_are_tried(monkeypatch):
     tried: list[tuple[set[str], bool]] = []
-    answers = iter([([], {"shupe": ("a time-shifted channel", 3.0)}), None, None])
+    answers = iter([([], {"shupe": ("a time-shifted channel", 3.0)}), ([], {}), ([], {})])
     monkeypatch.setattr(
         forward_search,
         "score_candidates",
