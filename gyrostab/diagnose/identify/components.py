@@ -16,9 +16,7 @@ from gyrostab.diagnose.settings import DEFAULTS, Settings
 PLAIN_LINE = "spectral_line"
 
 
-def find_components(
-    evidence: CandidateEvidence, *, settings: Settings = DEFAULTS
-) -> list[Component]:
+def select_components(evidence: CandidateEvidence, settings: Settings) -> list[Component]:
     """Return the rows of a candidate with enough evidence, or the best one."""
     evidence_nats = evidence.evidence_nats[0]
     rows = [row for row, nats in enumerate(evidence_nats) if nats > settings.component_nats]
@@ -55,9 +53,8 @@ def group_components(
     """Return the components of each effect with enough evidence, the strongest first."""
     out: dict[str, list[Component]] = {}
     for evidence in all_evidence:
-        out.setdefault(evidence.candidate.key, []).extend(
-            find_components(evidence, settings=settings)
-        )
+        components = select_components(evidence, settings)
+        out.setdefault(evidence.candidate.key, []).extend(components)
     for key, components in out.items():
         good = _drop_repeated_power(
             [

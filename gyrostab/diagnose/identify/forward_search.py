@@ -8,9 +8,9 @@ from dataclasses import replace
 from gyrostab.diagnose.identify.components import (
     PLAIN_LINE,
     are_lines,
-    find_components,
     group_components,
     merge_lines,
+    select_components,
     sum_evidence,
 )
 from gyrostab.diagnose.identify.examination import Examination

@@ -15,11 +15,12 @@ from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.correlated_bias import CorrelatedBias, find_correlated_bias
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.folds import fold_blocks
-from gyrostab.diagnose.identify.components import find_components
+from gyrostab.diagnose.identify.components import select_components
 from gyrostab.diagnose.predict.condition import condition_on, refit_powers
 from gyrostab.diagnose.predict.linear_model import State, initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.noise import NORMAL_95
 from gyrostab.simulate import simulate
@@ -125,7 +126,7 @@ def test_a_bias_with_another_spectrum_is_found_once():
     folds = fold_blocks(state.blocks)
     (evidence,) = compute_evidence([candidate], state.blocks, state, folds)
     assert evidence.evidence_nats[0, 0] > 10.0
-    in_model = condition_on(state, find_components(evidence))
+    in_model = condition_on(state, select_components(evidence, DEFAULTS))
     (evidence,) = compute_evidence([candidate], state.blocks, in_model, folds)
     assert evidence.evidence_nats[0, 0] < 0.0
 
