@@ -17,6 +17,7 @@ from gyrostab.diagnose.estimate.component_groups import (
     split_steps,
 )
 from gyrostab.diagnose.estimate.filter_sizes import fit_filter_sizes
+from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import axes_of
 from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.identify.selections import Selection
@@ -98,7 +99,9 @@ def fit_identifications(identifications: Identifications, baseline: xr.Dataset) 
         fitted
         for identification in identifications.identified
         for fitted in _fit_identification(
-            identification, identifications.state_without(identification, baseline), identifications
+            identification,
+            identifications.state_without(identification, baseline),
+            identifications.examination.count_evidence,
         )
     ]
 
@@ -113,7 +116,7 @@ def fit_expected(identifications: Identifications, baseline: xr.Dataset) -> list
 
 
 def _fit_identification(
-    identification: Selection, state: State, identifications: Identifications
+    identification: Selection, state: State, count_evidence: CountEvidence
 ) -> list[Fitted]:
     """Fit one identification: all axes together, or each group of axes alone."""
     kind = effects()[identification.effect]
@@ -134,52 +137,38 @@ def _fit_identification(
         if fitted_together
         else [
             ([part for part in identification.components if set(axes) & set(part.row)], state)
-            for axes in group_simultaneous_axes(
-                identification, state.blocks, identifications.examination.count_evidence
-            )
+            for axes in group_simultaneous_axes(identification, state.blocks, count_evidence)
         ]
     )
     return [
-        _fit_components(
-            identification,
-            axes_of(components, identification.axes),
-            components,
-            with_others,
-            identifications,
-        )
+        _fit_components(identification, components, with_others, count_evidence)
         for components, with_others in parts
     ]
 
 
 def _fit_components(
     identification: Selection,
-    axes: tuple[str, ...],
     components: list[Component],
     state: State,
-    identifications: Identifications,
+    count_evidence: CountEvidence,
 ) -> Fitted:
     """Fit the components of one entry, in the statistic that shows its size best."""
-    kind = effects()[identification.effect]
+    kind, axes = effects()[identification.effect], axes_of(components, identification.axes)
     values: dict[str, Any] = {}
     likeliest: dict[str, Any] = {}
     by_statistic: dict[Statistic, list[Component]] = {}
     for component in components:
         by_statistic.setdefault(component.statistic, []).append(component)
     statistic = _strongest_statistic(by_statistic)
-    filtered = by_statistic[statistic][0].is_filter
     sizes: Sizes
-    if filtered:
+    if by_statistic[statistic][0].is_filter:
         sizes, values = fit_filter_sizes(by_statistic[statistic], state)
     else:
-        own_sizes, likeliest_values = _estimate_sizes(
-            by_statistic[statistic], axes, state, identifications
-        )
-        for name, value in likeliest_values.items():
+        fit = SizeFit(by_statistic[statistic], axes, state, count_evidence)
+        own_sizes = statistic.estimate(fit)
+        for name, value in fit.likeliest.items():
             _store_value(likeliest, name, value, axes)
-        sizes = {
-            **_sizes_on_other_axes(by_statistic, statistic, axes, state, identifications),
-            **own_sizes,
-        }
+        sizes = {**_sizes_on_other_axes(by_statistic, statistic, fit), **own_sizes}
     for name, (value, *_) in sizes.items():
         _store_value(values, name, value, axes)
     values |= {
@@ -237,13 +226,12 @@ def _make_estimates(
 
 
 def _sizes_on_other_axes(
-    by_statistic: Mapping[Statistic, list[Component]],
-    statistic: Statistic,
-    axes: tuple[str, ...],
-    state: State,
-    identifications: Identifications,
+    by_statistic: Mapping[Statistic, list[Component]], statistic: Statistic, fit: SizeFit
 ) -> dict[str, Size]:
-    """Return sizes on axes that the strongest statistic does not cover, from the next that does."""
+    """Return sizes on axes that the strongest statistic does not cover, from the next that does.
+
+    `fit` is that of the strongest.
+    """
     covered_axes = {axis for component in by_statistic[statistic] for axis in component.row}
     added_sizes: dict[str, Size] = {}
     for other_statistic in sorted(
@@ -254,23 +242,13 @@ def _sizes_on_other_axes(
             axis for component in by_statistic[other_statistic] for axis in component.row
         } - covered_axes
         if lacking:
-            sizes, _ = _estimate_sizes(by_statistic[other_statistic], axes, state, identifications)
+            components = by_statistic[other_statistic]
+            sizes = other_statistic.estimate(replace(fit, components=components, likeliest={}))
             added_sizes |= {
                 name: size for name, size in sizes.items() if name.partition(".")[2] in lacking
             }
             covered_axes |= lacking
     return added_sizes
-
-
-def _estimate_sizes(
-    components: list[Component],
-    axes: tuple[str, ...],
-    state: State,
-    identifications: Identifications,
-) -> tuple[Sizes, Mapping[str, float | str]]:
-    """Return parameters with their errors from components in one statistic, and likely values."""
-    fit = SizeFit(components, axes, state, identifications.examination.count_evidence)
-    return components[0].statistic.estimate(fit), fit.likeliest
 
 
 def _store_value(values: dict[str, Any], name: str, value: Any, axes: tuple[str, ...]) -> None:
