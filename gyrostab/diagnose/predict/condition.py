@@ -39,11 +39,11 @@ def mean_columns(variant: Variant, row: int) -> list[Floats]:
     return [select_row(design, row) for design in variant.design]
 
 
-def free_covariance(state: State, axes: tuple[str, ...], density: Floats) -> State:
-    """Add any covariance of these axes with the others of this density, (block, band)."""
+def free_covariance(state: State, axis: str, density: Floats) -> State:
+    """Add any covariance of an axis with the others of this density, (block, band)."""
     nothing = np.zeros_like(density)
     for pair in pair_rows(state.blocks):
-        if set(pair) & set(axes):
+        if axis in pair:
             real_and_imaginary = [
                 np.concatenate([density, nothing], axis=-1),
                 np.concatenate([nothing, density], axis=-1),

@@ -156,7 +156,7 @@ class RotationOrder(Statistic):
                     column = np.zeros_like(density)
                     column[:, band] = density[:, band] / density[:, band].max()
                     state = state.with_columns("power", axis, [column])
-                    state = free_covariance(state, (axis,), column)
+                    state = free_covariance(state, axis, column)
                 line_power = square * state.blocks["turn_line_power"].values[k]
                 masked |= _visible_lines(line_power, axis, state)
         return state.with_columns("line", "all", [masked])

@@ -156,7 +156,7 @@ class SpectralLineStatistic(Statistic):
             if any(np.array_equal(column, other) for other in power_columns):
                 continue  # another line in the same band is already given
             state = state.with_columns("power", axis, [column])
-            state = free_covariance(state, (axis,), column)
+            state = free_covariance(state, axis, column)
         skirt = line_skirt(state.blocks, axis, component.line_index, state.settings)
         return state.with_columns("line", "all", [skirt])
 

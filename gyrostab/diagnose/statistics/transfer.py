@@ -116,7 +116,7 @@ class Transfer(Statistic):
             column[:, band] = power[:, band] / max(power[:, band].max(initial=0.0), 1e-300)
             if np.ptp(column[:, band]) > 0.5:
                 state = state.with_columns("power", axis, [column])
-            state = free_covariance(state, (axis,), column)
+            state = free_covariance(state, axis, column)
         return state
 
     def noise_shares(
