@@ -105,6 +105,8 @@ class Statistic:
     #: statistic and its size may be zero (`gyrostab.diagnose.result.finish.keep_supported`).
     unsupported_as = "~S(f)"
     error_shows_in: tuple[str, ...] = ()  # statistics that show an error of the form of an effect
+    #: `view` of each mismatch for which `predict_baseline` includes what an effect adds.
+    modelled_views: tuple[str, ...] = ()
     #: Variable of the null records that the evidence uses; "" to draw noise of the linear model.
     null_variable = ""
     # what an effect does
@@ -119,7 +121,6 @@ class Statistic:
     is_transfer = False  # effects add what follows a reference channel
     is_line = False  # effects add a spectral line
     is_count = False  # effects cause anomalous samples
-    is_in_baseline = False  # `predict_baseline` includes what an effect adds
     takes_noise = True  # an effect takes a share of the noise of an axis
     # how effects are searched and fitted
     has_course = False  # designs are by block, so that an effect may act in part of the record
@@ -324,7 +325,7 @@ class Statistic:
 
         `together` says whether several axes of the effect wander together there.
         """
-        return self.is_in_baseline
+        return region["view"] in self.modelled_views
 
     def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
         """Return the averaging times [s] at which a component shows; by default within a block."""

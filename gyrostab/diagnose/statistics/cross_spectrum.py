@@ -60,11 +60,11 @@ class CrossSpectrum(Statistic):
     view = "cross_axis"
     explained_views = ("cross_axis", "davar")
     containing_views = ("davar", "cross_axis")
+    modelled_views = explained_views
     unsupported_as = "~cov"
     error_shows_in = ("cross_spectrum",)
     null_variable = "cross"
     is_power_weighted = True
-    is_in_baseline = True
     is_pairwise = True
     has_course = True
     takes_noise = False  # only the effect itself gives the power of each axis

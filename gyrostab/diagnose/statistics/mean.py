@@ -81,9 +81,9 @@ class BlockMeanStatistic(Statistic):
         "spectrum",
     )
     containing_views: tuple[str, ...] = ("davar", "mean", "restart", "cross_axis")
+    modelled_views = explained_views
     unsupported_as = "~bias(t)"
     error_shows_in = ("mean",)
-    is_in_baseline = True
 
     def condition(self, state: State, component: Component) -> State:
         """Put columns into the means, and mask blocks in which the effect moves much."""

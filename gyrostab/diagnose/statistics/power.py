@@ -56,11 +56,11 @@ class Power(Statistic):
     view = "davar"
     explained_views = ("davar", "spectrum", "distribution")
     containing_views = ("davar", "distribution")
+    modelled_views = explained_views
     unsupported_as = "~N(t)"
     error_shows_in = ("power",)
     null_variable = "power"
     is_power_weighted = True
-    is_in_baseline = True
     is_power = True
     has_course = True
     is_ratio = True

@@ -40,7 +40,7 @@ from gyrostab.diagnose.reduce.outliers import (
 )
 from gyrostab.diagnose.reduce.zero_bin import sticking_axes, truncated_axes
 from gyrostab.diagnose.settings import DEFAULTS, Settings
-from gyrostab.diagnose.statistics.base import NullDraw, Region, SizeFit, Sizes, Statistic
+from gyrostab.diagnose.statistics.base import NullDraw, SizeFit, Sizes, Statistic
 from gyrostab.diagnose.statistics.mismatch_wording import capitalise_axes
 from gyrostab.diagnose.statistics.sample_sizes import estimate_from_counts
 from gyrostab.diagnose.statistics.scores import statistic_dataset, sum_over_windows, window_set
@@ -80,6 +80,7 @@ class SampleCounts(Statistic):
     view = "distribution"
     explained_views = ("distribution", "davar", "spectrum", "cross_axis")
     containing_views = ("davar", "mean", "restart", "cross_axis")
+    modelled_views = ("cross_axis",)  # anomalous blocks are left out there
     unsupported_as = "~outliers"
     error_shows_in = ("sample_counts",)
     is_count = True
@@ -199,10 +200,6 @@ class SampleCounts(Statistic):
             fit.count_evidence,
             fit.state.settings,
         )
-
-    def is_modelled_in(self, region: Region, *, together: bool) -> bool:
-        """Return whether the mismatch is of several axes: anomalous blocks are left out there."""
-        return bool(region["view"] == "cross_axis")
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
         samples = _COUNT_TEXTS.get(region["quantity"], "an unusual distribution of its samples")

@@ -65,6 +65,7 @@ class SpectralLineStatistic(Statistic):
     view = "spectrum"
     explained_views = ("spectrum", "davar", "distribution", "cross_axis")
     containing_views = ("davar", "cross_axis")
+    modelled_views = ("cross_axis",)  # lines that axes have in common
     is_line = True
     has_size = False
     uses_line_spectra = True
@@ -233,10 +234,6 @@ class SpectralLineStatistic(Statistic):
             <= tau
             <= region["tau_max_s"] * settings.line_tau_ratio
         )
-
-    def is_modelled_in(self, region: Region, *, together: bool) -> bool:
-        """Return whether the mismatch is of several axes: the baseline has their common lines."""
-        return bool(region["view"] == "cross_axis")
 
     def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
         """Return the averaging time at which the Allan variance of the line is largest."""
