@@ -78,6 +78,10 @@ class State:
         )
         return [-np.inf] * any_count + [0.0] * added_count
 
+    def is_recalibrated(self, axis: str) -> bool:
+        """Return whether the noise of an axis was calibrated with the effects in the model."""
+        return axis in self.baseline.attrs.get("recalibrated", ())
+
     @property
     def axes(self) -> list[str]:
         """Names of the axes."""

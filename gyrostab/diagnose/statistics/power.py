@@ -177,10 +177,8 @@ class Power(Statistic):
                 state.blocks, axis, component.candidate.effect, component.variant.values, expected
             )
             state = replace(state, blocks=blocks).with_columns("line", "all", [stopped])
-        if self.is_filter(component.variant) and axis in state.baseline.attrs.get(
-            "recalibrated", ()
-        ):
-            return state  # the noise of the baseline is filtered already
+            if state.is_recalibrated(axis):
+                return state  # the noise of the baseline is filtered already
         return state.with_columns(
             "added_power" if component.variant.squared else "power",
             axis,

@@ -96,7 +96,7 @@ class WanderingBias(RandomProcess):
     def condition(self, state: State, component: Component) -> State:
         """Put the bias into the noise of the means and of the powers, unless it is in both."""
         axis, time = component.row[0], component.variant.time
-        if _is_calibrated_with(axis, state):
+        if state.is_recalibrated(axis):
             return state
         rms = _recall_fit(partial(fit_rms, state, axis, time), b"rms", axis, state, np.array(time))
         if rms is None:
@@ -132,14 +132,9 @@ def _with_time(variant: Variant, time: float) -> Variant:
     return replace(variant, time=time, values={**variant.values, "correlation_time": time})
 
 
-def _is_calibrated_with(axis: str, state: State) -> bool:
-    """Return whether the noise of an axis was calibrated again with the effects in the model."""
-    return axis in state.baseline.attrs.get("recalibrated", ())
-
-
 def _find_bias(state: State, axis: str) -> CorrelatedBias | None:
     """Find the bias of an axis next to all other effects."""
-    if _is_calibrated_with(axis, state):  # with this bias
+    if state.is_recalibrated(axis):  # with this bias
         without = state.baseline.drop_vars(
             ["wander_square", "wander_time", "wander_walk"], errors="ignore"
         )
