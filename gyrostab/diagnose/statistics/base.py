@@ -78,6 +78,10 @@ class SizeFit:
     #: Filled by an estimate that averages over a grid: the values at its likeliest point.
     likeliest: dict[str, float | str] = field(default_factory=dict)
 
+    def key(self, name: str, axis: str) -> str:
+        """Return the key of a size in `Sizes`."""
+        return name if len(self.axes) == 1 else f"{name}.{axis}"
+
 
 class Competitor(NamedTuple):
     """Another form of an effect that competes with it."""
@@ -101,12 +105,12 @@ class Statistic:
     #: `view` of each mismatch whose score against the baseline with effects contains what an effect
     #: in this statistic contributes.
     containing_views: tuple[str, ...] = ()
+    #: `view` of each mismatch for which `predict_baseline` includes what an effect adds.
+    modelled_views: tuple[str, ...] = ()
     #: Nuisance alternative as which an effect is reported on the axes where it shows in this
     #: statistic and its size may be zero (`gyrostab.diagnose.result.finish.keep_supported`).
     unsupported_as = "~S(f)"
     error_shows_in: tuple[str, ...] = ()  # statistics that show an error of the form of an effect
-    #: `view` of each mismatch for which `predict_baseline` includes what an effect adds.
-    modelled_views: tuple[str, ...] = ()
     #: Variable of the null records that the evidence uses; "" to draw noise of the linear model.
     null_variable = ""
     # what an effect does
@@ -302,7 +306,7 @@ class Statistic:
                 if component.variant.squared:
                     size = (*_square_root(value, sd), *np.sqrt(np.maximum(ends, 0.0)))
                     likeliest = float(np.sqrt(max(likeliest, 0.0)))
-                key = name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"
+                key = fit.key(name, component.row[0])
                 out[key], fit.likeliest[key] = size, likeliest
             out |= averaged.nuisance
             points.append(dict(averaged.likeliest_variant.values))

@@ -114,7 +114,7 @@ class RandomProcess(BlockMeanStatistic):
         out: dict[str, Size] = {}
         for component in fit.components:
             (name,) = component.variant.columns
-            key = name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"
+            key = fit.key(name, component.row[0])
             out[key] = _walk_size(component, fit.state, component.variant)
         return out
 

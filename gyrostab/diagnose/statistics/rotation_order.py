@@ -177,8 +177,9 @@ class RotationOrder(Statistic):
                     "latitude": _latitude_from_rate(across, error * across),
                     "toolface": (angle, math.degrees(error)),
                 }
-            label = "" if len(fit.axes) == 1 else f".{component.row[0]}"
-            out |= {f"amplitude{label}": (size, sd), f"phase{label}": (angle, math.degrees(error))}
+            axis = component.row[0]
+            out[fit.key("amplitude", axis)] = (size, sd)
+            out[fit.key("phase", axis)] = (angle, math.degrees(error))
             harmonics = fit.state.blocks["harmonic"].values
             out["order"] = (float(harmonics[component.line_index % harmonics.size]), 0.0)
         return out

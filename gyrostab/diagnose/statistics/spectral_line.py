@@ -206,8 +206,8 @@ class SpectralLineStatistic(Statistic):
             response = np.sinc(frequency[0] / float(blocks.attrs["sampling_rate_hz"]))
             if is_sway:
                 response *= math.sqrt(2.0)
-            label = "" if len(fit.axes) == 1 or is_sway else f".{component.row[0]}"
-            out[f"{name}{label}"] = (amplitude[0] / response, amplitude[1] / response)
+            key = name if is_sway else fit.key(name, component.row[0])
+            out[key] = (amplitude[0] / response, amplitude[1] / response)
             out["frequency"] = frequency
         return out
 

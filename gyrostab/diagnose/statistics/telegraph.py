@@ -172,8 +172,8 @@ class TelegraphStatistic(BlockMeanStatistic):
                 if component is ranked[0] or float(np.cov(component_course, course)[0, 1]) >= 0.0
                 else -1.0
             )
-            label = name if len(fit.axes) == 1 else f"{name}.{component.row[0]}"
-            out[label] = (sign * float(mean[0]), float(math.sqrt(covariance[0, 0])))
+            key = fit.key(name, component.row[0])
+            out[key] = (sign * float(mean[0]), float(math.sqrt(covariance[0, 0])))
         stays = max(float(first.values["switches"]) / 2.0, 1.0)  # on either level
         return out | {
             time: (float(first.values[time]), float(first.values[time]) / math.sqrt(stays))

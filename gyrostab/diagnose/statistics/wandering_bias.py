@@ -118,8 +118,9 @@ class WanderingBias(RandomProcess):
             (name,), axis = component.variant.columns, component.row[0]
             bias = _find_bias(fit.state, axis)
             if bias is not None:
-                key = name if len(fit.axes) == 1 else f"{name}.{axis}"
-                out[key] = _log_normal(math.log(bias.rms), float(bias.covariance[0, 0]))
+                out[fit.key(name, axis)] = _log_normal(
+                    math.log(bias.rms), float(bias.covariance[0, 0])
+                )
                 times.append((math.log(bias.time), 1.0 / float(bias.covariance[1, 1])))
         if times:
             log_time, weight = np.array(times).T
