@@ -104,9 +104,7 @@ class Candidate:
     driver: tuple[str, ...]
     variants: tuple[Variant, ...]  # over the grid of nuisance parameters
     reference: tuple[str, ...] = ()  # reference channel or axis of each column, for a transfer
-    is_per_axis: bool = (
-        True  # whether every axis has its own size; otherwise one size holds for all
-    )
+    is_per_axis: bool = True  # whether every axis has its own size, instead of one for all
 
     @property
     def key(self) -> str:

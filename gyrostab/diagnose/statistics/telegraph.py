@@ -93,12 +93,11 @@ class TelegraphStatistic(BlockMeanStatistic):
         It is a lower bound of a log Bayes factor, which exceeds x nats by chance in at most exp(-x)
         of all records. Some of the null records are therefore enough if records are long.
         """
-        records = trial.data.sizes.get("record", 1)
-        searched = (
-            trial.data.isel(record=slice(max(1, _MAX_NULL_BLOCKS // trial.data.sizes["block"])))
-            if "record" in trial.data.dims
-            else trial.data
-        )
+        searched, records = trial.data, trial.data.sizes.get("record", 1)
+        if trial.is_null:
+            searched = searched.isel(
+                record=slice(max(1, _MAX_NULL_BLOCKS // searched.sizes["block"]))
+            )
         rows = self.rows(group[0], trial.state)
         evidence_nats = np.full((records, len(rows)), -np.inf)
         courses: list[tuple[TelegraphCourses, SwitchingEvidence | None]] = []
@@ -209,7 +208,7 @@ def _with_free_levels(evidence: CandidateEvidence, trial: Trial) -> CandidateEvi
 
     Each visit to a level has its own height. In null records it is that of two levels.
     """
-    if "record" in trial.data.dims:
+    if trial.is_null:
         return evidence
     evidence_nats, best = evidence.evidence_nats.copy(), list(evidence.best)
     for row, (axis,) in enumerate(evidence.rows):
