@@ -207,21 +207,22 @@ def _allowed_range(component: Component, column: str, state: State) -> tuple[flo
 
 
 def find_equivalent_effects(
-    effect: str, components: Sequence[Component], state: State, *, lines: int = 0
+    components: Sequence[Component], state: State, *, lines: int = 0
 ) -> list[str]:
-    """Return effects that the data cannot separate from this one; `lines` counts all lines."""
+    """Return effects that the data cannot separate from that of the components.
+
+    `lines` counts all lines.
+    """
+    effect, blocks = components[0].candidate.effect, state.blocks
     out = list(effects()[effect].look_alikes("always"))
-    blocks = state.blocks
     if (
         effect == "spectral_line"
         and "profile" not in blocks
         and lines >= state.settings.min_comb_lines
     ):
         out.append("feedback_reset")
-    if (
-        effect == "dead_zone" and len(state.axes) == 1
-    ):  # no other axis shows whether the sample was lost
-        out.append("held_samples")
+    if effect == "dead_zone" and len(state.axes) == 1:
+        out.append("held_samples")  # no other axis shows whether the sample was lost
     if effect == "dead_zone" and any(
         possibly_truncated_axes(blocks)[state.axes.index(component.row[0])]
         for component in components
@@ -250,7 +251,7 @@ def find_equivalent_effects(
 
 
 def find_spectral_alternatives(
-    effect: str, components: Sequence[Component], state: State, examination: Examination
+    components: Sequence[Component], state: State, examination: Examination
 ) -> list[str]:
     """Return effects of the same channel, if the spectrum does not tell them apart.
 
@@ -259,8 +260,10 @@ def find_spectral_alternatives(
     effects in the model.
     """
     powers = [component for component in components if component.statistic.is_power]
-    others = list(effects()[effect].look_alikes("any spectrum"))
-    if not others or not powers:
+    if not powers:
+        return []
+    others = list(effects()[powers[0].candidate.effect].look_alikes("any spectrum"))
+    if not others:
         return []
     for part in powers:
         if all(variant.values.get("resonance") for variant in (part.variant, *part.close)):

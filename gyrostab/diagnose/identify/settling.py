@@ -106,14 +106,9 @@ def _finish_identification(
         for component in components_of(chosen)
         if component.candidate.effect == PLAIN_LINE
     }
-    rivals += find_equivalent_effects(
-        identification.effect, identification.components, state, lines=len(lines)
-    )
+    rivals += find_equivalent_effects(identification.components, state, lines=len(lines))
     spectral_alternatives = find_spectral_alternatives(
-        identification.effect,
-        [component for layer in layers for component in layer],
-        weighted,
-        examination,
+        [component for layer in layers for component in layer], weighted, examination
     )
     rivals += spectral_alternatives
     alternatives = dict.fromkeys([*identification.alternatives, *rivals])

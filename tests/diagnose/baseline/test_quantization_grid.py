@@ -188,8 +188,8 @@ def test_both_names_are_given_if_the_bins_do_not_decide() -> None:
         20.0,
     )
     state = initial_state(blocks, calibrate_noise(blocks))
-    assert "rate_quantization" in find_equivalent_effects("dead_zone", [component], state)
+    assert "rate_quantization" in find_equivalent_effects([component], state)
     cut_blocks = cut_record(np.rint, zone=1.0, size=15_000)
     assert "rate_quantization" not in find_equivalent_effects(
-        "dead_zone", [component], initial_state(cut_blocks, calibrate_noise(cut_blocks))
+        [component], initial_state(cut_blocks, calibrate_noise(cut_blocks))
     )
