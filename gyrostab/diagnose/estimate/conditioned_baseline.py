@@ -148,9 +148,7 @@ def expected_baseline(
 ) -> xr.Dataset:
     """Return the baseline with the expected effects only, fitted to the training blocks."""
     return (
-        predict_baseline(
-            replace(identifications, identified=(), unidentified=()), baseline, training
-        )
+        predict_baseline(replace(identifications, identified=()), baseline, training)
         if identifications.expected
         else baseline
     )

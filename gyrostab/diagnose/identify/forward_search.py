@@ -283,9 +283,7 @@ def identify_expected_effects(examination: Examination) -> Examination:
     identified: list[Selection] = []
     state, remaining = examination.start, list(examination.model_effects)
     needed = examination.settings.component_nats
-    rounds = MAX_ROUNDS_PER_EFFECT * len(remaining)
-    while remaining and rounds > 0:
-        rounds -= 1
+    for _ in range(MAX_ROUNDS_PER_EFFECT * len(remaining)):
         choices = [(_best_components(effect, examination, state), effect) for effect in remaining]
         choices = [choice for choice in choices if sum_evidence(choice[0]) > needed]
         if not choices:

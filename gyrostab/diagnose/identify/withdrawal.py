@@ -115,10 +115,9 @@ def _find_fluctuation(
 ) -> list[Selection]:
     """Return what a free noise level explains on an axis, instead of withdrawn effects."""
     free = [candidate for candidate in examination.candidates if candidate.effect == "~N(t)"]
-    components_by_key = examination.find_components(free, state)
     components = [
         component
-        for component in components_by_key.get("~N(t)", [])
+        for component in examination.find_components(free, state).get("~N(t)", [])
         if component.row == (axis,) and component.evidence_nats > examination.threshold
     ]
     names = [identification.effect for identification in weak]
