@@ -84,9 +84,7 @@ def ladder(name: str, strength: float, number: int) -> list[float]:
         for candidate in effect_candidates(reduced, baseline["coefficient"])[0]
         if candidate.effect == name and candidate.statistic.is_in_means
     ]
-    scored = evidence_by_effect(
-        compute_evidence(tried, reduced, initial_state(reduced, baseline), folds)
-    )
+    scored = evidence_by_effect(compute_evidence(tried, reduced, initial_state(reduced, baseline)))
     return [*total, max(float(gain[0]) for gain in scored.values())]
 
 

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import xarray as xr
 
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify.components import group_components
 from gyrostab.diagnose.identify.examination import Examination
@@ -32,7 +31,7 @@ def select_candidate(candidates: Iterable[Candidate], effect: str, statistic: st
 def find_components(candidates: Sequence[Candidate], state: State) -> dict[str, list[Component]]:
     """Return the components of candidates by key, by their evidence on the blocks of a state."""
     blocks = state.blocks
-    return group_components(compute_evidence(candidates, blocks, state, fold_blocks(blocks)))
+    return group_components(compute_evidence(candidates, blocks, state))
 
 
 def winning_forms(components: Sequence[Component], state: State, error: float = 0.0) -> set[str]:
@@ -57,7 +56,6 @@ def make_identifications(
     """Return identifications as a selection would, with a threshold of 8 nats."""
     examination = Examination(
         tuple(candidates),
-        xr.DataArray(),
         CountEvidence({}),
         8.0,
         state,  # type: ignore[arg-type]

@@ -10,7 +10,6 @@ import xarray as xr
 
 from gyrostab.arrays import Array
 from gyrostab.diagnose.baseline.quantization_grid import rounded_rates
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import EXPECTED, CountEvidence, has_coarse_grid
 from gyrostab.diagnose.identify.components import group_components
 from gyrostab.diagnose.identify.selections import Selection, condition_on_selections, form_error
@@ -36,7 +35,6 @@ class Examination:
     """A record that is examined for effects beyond those of its simulation."""
 
     candidates: Sequence[Candidate]  # effects and nuisance alternatives
-    folds: xr.DataArray  # from `gyrostab.diagnose.evidence.folds.fold_blocks`
     count_evidence: CountEvidence
     threshold: float  # evidence [nats] that noise alone exceeds with the false-alarm probability
     start: State  # with the expected effects in the model, once they are identified
@@ -62,9 +60,7 @@ class Examination:
         self, candidates: Sequence[Candidate], state: State
     ) -> list[CandidateEvidence]:
         """Compute the held-out evidence of candidates on the record."""
-        return compute_evidence(
-            candidates, state.blocks, state, self.folds, count_evidence=self.count_evidence
-        )
+        return compute_evidence(candidates, state.blocks, state, count_evidence=self.count_evidence)
 
     def find_components(
         self, candidates: Sequence[Candidate], state: State
@@ -98,12 +94,11 @@ def prepare_examination(
     that of the draws for statistics that the null records do not contain. The simulation contains
     the `model_effects`, but not the baseline; they are in the model before the selection begins.
     """
-    folds = fold_blocks(blocks)
     effects, reasons = effect_candidates(blocks, baseline["coefficient"], settings=settings)
     candidates = [*effects, *nuisance_alternatives(blocks)]
     start = initial_state(blocks, baseline, settings=settings)
     best, count_evidence = _score_null_records(
-        candidates, nulls, start, folds, np.random.default_rng(seed), progress
+        candidates, nulls, start, np.random.default_rng(seed), progress
     )
     if not count_evidence.rounded.any() and (blocks["quantization_step"] > 0.0).any():
         reasons["rate_quantization"] = (
@@ -113,7 +108,7 @@ def prepare_examination(
         )
     threshold = fit_best_evidence(best, settings=settings).value_at(level)
     return Examination(
-        candidates, folds, count_evidence, threshold, start, tuple(model_effects), best, reasons
+        candidates, count_evidence, threshold, start, tuple(model_effects), best, reasons
     )
 
 
@@ -121,7 +116,6 @@ def _score_null_records(
     candidates: Sequence[Candidate],
     nulls: Iterable[xr.Dataset],
     state: State,
-    folds: xr.DataArray,
     rng: np.random.Generator,
     progress: Stage,
 ) -> tuple[Array, CountEvidence]:
@@ -139,14 +133,14 @@ def _score_null_records(
     small: list[xr.Dataset] = []
     records = 0
     for chunk in nulls:
-        chunks.append(compute_evidence(by_chunk, chunk, state, folds, rng=rng))
+        chunks.append(compute_evidence(by_chunk, chunk, state, rng=rng))
         small.append(chunk[["mean", *EXPECTED]])
         records += chunk.sizes["record"]
         progress("naming", 0, records)
     rounded = rounded_rates(state.blocks, state.baseline, settings=state.settings)
     count_evidence = CountEvidence.gathered(small, rounded)
     data = xr.concat(small, "record", data_vars="minimal", coords="minimal", compat="override")
-    last = compute_evidence(at_end, data, state, folds, count_evidence=count_evidence)
+    last = compute_evidence(at_end, data, state, count_evidence=count_evidence)
     for of_chunks in zip(*chunks, strict=True):
         evidence_nats = np.concatenate([evidence.evidence_nats for evidence in of_chunks])
         last.append(replace(of_chunks[0], evidence_nats=evidence_nats))

@@ -210,7 +210,7 @@ def _select_next(
         shifted = {
             key: beaten_by
             for key, effect_components, with_other in option
-            if (beaten_by := _find_shifted(effect_components, with_other, examination))
+            if (beaten_by := _find_shifted(effect_components, with_other))
         }
         if shifted:
             failed |= shifted
@@ -260,11 +260,9 @@ def _leave_out_impossible(
                 required[key] = examination.required_nats(components[key], chosen)
 
 
-def _find_shifted(
-    components: Sequence[Component], state: State, examination: Examination
-) -> tuple[str, float] | None:
+def _find_shifted(components: Sequence[Component], state: State) -> tuple[str, float] | None:
     """Return the time-shifted channel that beats an effect, and by how much [nats]."""
-    passed, _, nats = passes_time_shift_test(components, state, examination.folds)
+    passed, _, nats = passes_time_shift_test(components, state)
     return None if passed else ("a time-shifted channel", nats)
 
 

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-import xarray as xr
 from scipy.optimize import lsq_linear
 
 from gyrostab.arrays import Floats
@@ -290,7 +289,7 @@ def _any_spectrum(component: Component, state: State) -> Candidate:
 
 
 def passes_time_shift_test(
-    components: Sequence[Component], state: State, folds: xr.DataArray
+    components: Sequence[Component], state: State
 ) -> tuple[bool, float, float]:
     """Test whether an effect explains more than time-shifted surrogates of its channel.
 
@@ -312,7 +311,7 @@ def passes_time_shift_test(
     is_similar = np.zeros(shifts.size, np.bool_)
     for component in following_components:
         surrogates = make_surrogates(component, state.blocks, state.baseline["coefficient"], shifts)
-        values = _compute_shifted_evidence(component, surrogates, state, folds)
+        values = _compute_shifted_evidence(component, surrogates, state)
         real += float(values[0])
         shifted += values[1:]
         row, limit = state.axes.index(component.row[0]), state.settings.majority_share
@@ -330,7 +329,7 @@ def passes_time_shift_test(
 
 
 def _compute_shifted_evidence(
-    component: Component, surrogates: Sequence[Variant | None], state: State, folds: xr.DataArray
+    component: Component, surrogates: Sequence[Variant | None], state: State
 ) -> Floats:
     """Return the evidence of the channel, then of each surrogate, on the axis of a component.
 
@@ -344,7 +343,7 @@ def _compute_shifted_evidence(
         )
         for number, surrogate in enumerate(surrogates)
     ]
-    all_evidence = compute_evidence([component.candidate, *shifted], state.blocks, state, folds)
+    all_evidence = compute_evidence([component.candidate, *shifted], state.blocks, state)
     row = state.axes.index(component.row[0])
     return np.array([evidence.evidence_nats[0, row] for evidence in all_evidence])
 

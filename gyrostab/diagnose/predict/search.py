@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Array, Floats, Ints
+from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.products import held_out_evidence
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence
@@ -46,7 +47,6 @@ def compute_evidence(
     candidates: Sequence[Candidate],
     data: xr.Dataset,
     state: State,
-    folds: xr.DataArray,
     *,
     count_evidence: CountEvidence | None = None,
     rng: np.random.Generator | None = None,
@@ -56,7 +56,7 @@ def compute_evidence(
     Without `count_evidence`, sample counts are left out. `rng` generates the statistics that null
     records do not have.
     """
-    trial = Trial(data, state, folds, count_evidence, rng)
+    trial = Trial(data, state, fold_blocks(state.blocks), count_evidence, rng)
     groups: dict[tuple[object, ...], list[Candidate]] = {}
     for candidate in candidates:
         group_key = (candidate.statistic, candidate.reference, candidate.is_per_axis)

@@ -14,7 +14,6 @@ from gyrostab import diagnose
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.correlated_bias import CorrelatedBias, find_correlated_bias
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import select_components
 from gyrostab.diagnose.predict.condition import condition_on, refit_powers
 from gyrostab.diagnose.predict.linear_model import State, initial_state
@@ -123,11 +122,10 @@ def test_a_bias_with_another_spectrum_is_found_once():
         for candidate in effects
         if candidate.key == "gauss_markov" and candidate.statistic.name == "wandering_bias"
     ]
-    folds = fold_blocks(state.blocks)
-    (evidence,) = compute_evidence([candidate], state.blocks, state, folds)
+    (evidence,) = compute_evidence([candidate], state.blocks, state)
     assert evidence.evidence_nats[0, 0] > 10.0
     in_model = condition_on(state, select_components(evidence, DEFAULTS))
-    (evidence,) = compute_evidence([candidate], state.blocks, in_model, folds)
+    (evidence,) = compute_evidence([candidate], state.blocks, in_model)
     assert evidence.evidence_nats[0, 0] < 0.0
 
 

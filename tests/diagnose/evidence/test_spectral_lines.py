@@ -10,7 +10,6 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence, line_skirt
 from gyrostab.diagnose.evidence.wandering import with_process
 from gyrostab.diagnose.identify import forward_search
@@ -145,7 +144,7 @@ def test_each_line_is_a_separate_identification(lines: tuple[Selection, ...]) ->
 @pytest.mark.full
 def test_evidence_is_recalled_only_where_nothing_has_changed() -> None:
     blocks = sines({3.4: 0.4}, size=6_000, axes=2)
-    start, folds = initial_state(blocks, calibrate_noise(blocks)), fold_blocks(blocks)
+    start = initial_state(blocks, calibrate_noise(blocks))
     effects, _ = effect_candidates(blocks, start.baseline["coefficient"])
     every = [*effects, *nuisance_alternatives(blocks)]
     one_of_each = {one.statistic.name: one for one in every}
@@ -170,14 +169,14 @@ def test_evidence_is_recalled_only_where_nothing_has_changed() -> None:
             start, baseline=with_process(start.baseline, "x", np.full(start.masked.shape[1], 1e-3))
         ),
     }
-    compute_evidence(candidates, blocks, start, folds)
+    compute_evidence(candidates, blocks, start)
     added = {}
     for name, state in states.items():
         tried = candidates if name in ("line", "jump", "random walk") else quick
         before = len(start.memory)
-        recalled = compute_evidence(tried, state.blocks, state, folds)
+        recalled = compute_evidence(tried, state.blocks, state)
         added[name] = len(start.memory) - before
-        fresh = compute_evidence(tried, state.blocks, replace(state, memory={}), folds)
+        fresh = compute_evidence(tried, state.blocks, replace(state, memory={}))
         for one, other in zip(recalled, fresh, strict=True):
             assert one.candidate is other.candidate
             np.testing.assert_array_equal(one.evidence_nats, other.evidence_nats)

@@ -8,7 +8,6 @@ import xarray as xr
 from scipy.signal import lfilter
 
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.identifiability import keep_physical, passes_time_shift_test
 from gyrostab.diagnose.nulls.records import null_records
@@ -162,7 +161,7 @@ def test_only_motion_is_a_misalignment(moves: bool) -> None:
         for leak in effect_candidates(state.blocks, state.baseline["coefficient"])[0]
         if leak.key == "misalignment(y)"
     ]
-    (evidence,) = compute_evidence(leaks, state.blocks, state, fold_blocks(state.blocks))
+    (evidence,) = compute_evidence(leaks, state.blocks, state)
     assert (float(evidence.evidence_nats[0, 0]) > 20.0) == moves
     assert moves or float(evidence.evidence_nats.max()) < 3.0
 
@@ -177,7 +176,7 @@ def test_leak_must_exceed_time_shifted_surrogates(leak: float) -> None:
     misalignment = candidate(state, "misalignment", "mean")
     variant = next(choice for choice in misalignment.variants if choice.columns == ("y",))
     beats, p_value, _ = passes_time_shift_test(
-        [Component(misalignment, variant, ("x",), 20.0)], state, fold_blocks(state.blocks)
+        [Component(misalignment, variant, ("x",), 20.0)], state
     )
     assert np.isfinite(p_value)
     assert beats == bool(leak)

@@ -10,7 +10,6 @@ import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.core import diagnose
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.evidence.spectral_lines import line_evidence
 from gyrostab.diagnose.identify.examination import nuisance_alternatives
@@ -132,7 +131,6 @@ def test_tails_of_blocks_in_which_an_axis_turns_do_not_count():
     turned[1, ::3] = True
     blocks["kurtosis"] = blocks["kurtosis"].where(~turned, 4.0).where(turned, 0.0)
     state = initial_state(blocks, calibrate_noise(blocks))
-    folds = fold_blocks(blocks)
     tails = [item for item in nuisance_alternatives(blocks) if item.effect == "~outliers"]
     moments = np.zeros(2), np.full(2, 0.4)
     evidence = [
@@ -140,7 +138,6 @@ def test_tails_of_blocks_in_which_an_axis_turns_do_not_count():
             tails,
             blocks,
             replace(state, masked=masked),
-            folds,
             count_evidence=CountEvidence({"kurtosis": moments}),
         )[0].evidence_nats[0, 1]
         for masked in (np.zeros_like(turned), turned)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify import forward_search
 from gyrostab.diagnose.identify.examination import Examination, nuisance_alternatives
@@ -42,7 +41,7 @@ def _examine(values, rate, channels, chosen):
         if candidate.effect in chosen
     ]
     state = initial_state(blocks, baseline)
-    return Examination(chosen_candidates, fold_blocks(blocks), CountEvidence({}), 8.0, state)
+    return Examination(chosen_candidates, CountEvidence({}), 8.0, state)
 
 
 def test_a_channel_that_two_others_make_superfluous_is_dropped():

@@ -11,7 +11,6 @@ from scipy.signal import lfilter
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify import identifiability
 from gyrostab.diagnose.identify.identifiability import passes_time_shift_test
 from gyrostab.diagnose.predict.candidates import Candidate, Component
@@ -54,7 +53,6 @@ def _run_time_shift_test(sensitivity: float, period: float) -> tuple[bool, float
     return passes_time_shift_test(
         [Component(candidate, variant, ("x",), 50.0)],
         initial_state(blocks, baseline),
-        fold_blocks(blocks),
     )
 
 
@@ -93,7 +91,7 @@ def test_an_unrelated_channel_is_no_better_than_its_surrogates(monkeypatch):
         known, _ = effect_candidates(blocks, state.baseline["coefficient"])
         shupe = select_candidate(known, "shupe", "mean")
         components = find_components([shupe], state)[shupe.key]
-        return passes_time_shift_test(components, state, fold_blocks(blocks))[1]
+        return passes_time_shift_test(components, state)[1]
 
     assert np.mean([p_value(seed) for seed in range(4, 9)]) > 0.4
 
@@ -158,10 +156,10 @@ class Records:
         candidate = replace(self.candidate, variants=tuple(filter(None, rebuilt)))
         blocks["mean"] = blocks["mean"].copy(data=self.draw_means(candidate, strength, rng))
         blocks["power"] = blocks["power"].copy(data=self.draw_powers(candidate, strength, rng))
-        state, folds = initial_state(blocks, self.baseline), fold_blocks(blocks)
-        (evidence,) = compute_evidence([candidate], blocks, state, folds)
+        state = initial_state(blocks, self.baseline)
+        (evidence,) = compute_evidence([candidate], blocks, state)
         component = Component(candidate, evidence.best[0], ("x",), 0.0)
-        return passes_time_shift_test([component], state, folds)[1]
+        return passes_time_shift_test([component], state)[1]
 
     def draw_means(
         self, candidate: Candidate, strength: float, rng: np.random.Generator

@@ -9,7 +9,6 @@ import pytest
 import xarray as xr
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.identify import withdrawal
 from gyrostab.diagnose.identify.examination import Examination, nuisance_alternatives
@@ -63,9 +62,7 @@ def test_noise_that_fluctuates_on_one_axis_stays_named_on_the_others(monkeypatch
     monkeypatch.setattr(
         withdrawal, "measure_fluctuation", lambda state, axis: 20.0 if axis == "x" else 0.0
     )
-    examination = Examination(
-        [], fold_blocks(blocks), CountEvidence({}), 8.0, start, (), np.zeros(1), {}
-    )
+    examination = Examination([], CountEvidence({}), 8.0, start, (), np.zeros(1), {})
     remaining, _ = withdrawal.withdraw_effects(examination, [selection], [])
     assert [item.axes for item in remaining] == [("y", "z")]
     assert remaining[0].evidence_nats == pytest.approx(198.5)  # 1.5 nats for the second axis
@@ -136,9 +133,7 @@ def test_noisy_axes_are_not_correlated() -> None:
         )
     )
     state = initial_state(blocks, calibrate_noise(blocks))
-    examination = Examination(
-        nuisance_alternatives(blocks), fold_blocks(blocks), CountEvidence({}), 7.0, state
-    )
+    examination = Examination(nuisance_alternatives(blocks), CountEvidence({}), 7.0, state)
 
     (covariance,) = (
         evidence

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.predict.windows import (
@@ -121,10 +120,7 @@ def test_a_jump_at_a_restart_needs_less_evidence(restarted):
     equal = replace(
         weighed, variants=tuple(replace(variant, weight=1.0) for variant in weighed.variants)
     )
-    evidence = [
-        compute_evidence([candidate], moved, state, fold_blocks(moved))[0]
-        for candidate in (weighed, equal)
-    ]
+    evidence = [compute_evidence([candidate], moved, state)[0] for candidate in (weighed, equal)]
     assert (evidence[0].evidence_nats > evidence[1].evidence_nats + 0.5).any()
     assert {variant.values["at"] for variant in evidence[0].best} == {_BACK}
 

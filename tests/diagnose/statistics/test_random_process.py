@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
-from gyrostab.diagnose.evidence.folds import fold_blocks
 from gyrostab.diagnose.identify.examination import nuisance_alternatives
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
@@ -26,5 +25,5 @@ def test_walk_beyond_the_grid_is_found(excess: float, is_found: bool) -> None:
     model = {"noise": {"N": 0.003, "B": 0.004, "K": 0.02}, "log": {"axes": ["x"]}}
     state = initial_state(blocks, baseline_from_model(blocks, model))
     (walk,) = [item for item in nuisance_alternatives(blocks) if item.effect == "~red"]
-    (evidence,) = compute_evidence([walk], blocks, state, fold_blocks(blocks))
+    (evidence,) = compute_evidence([walk], blocks, state)
     assert (evidence.evidence_nats[0, 0] > 10.0) == is_found
