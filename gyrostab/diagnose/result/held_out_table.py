@@ -52,6 +52,7 @@ def measure_held_out(
     The likelihood of `held_out` is that of means, powers and cross-spectra. Sample counts,
     random biases and phase-locked components are in none of these: their evidence is added.
     """
+    settings = identifications.state.settings
     with_course, random_nats = _remove_random_biases(identifications)
     first_fit = [
         fitted
@@ -65,13 +66,8 @@ def measure_held_out(
         for component in components_of(identified)
         if component.statistic.is_count
     )
-    clean = mask_anomalous_blocks(
-        blocks,
-        [*components_of(identified), *components_of(with_course.expected)],
-        identifications.state.settings,
-    )
-
-    settings = identifications.state.settings
+    anomalous = components_of([*identified, *with_course.expected])
+    clean = mask_anomalous_blocks(blocks, anomalous, settings)
     calibrate = _make_calibration(blocks, baseline, settings)
 
     def before(training: Bools) -> xr.Dataset:
