@@ -105,7 +105,7 @@ class RandomProcess(BlockMeanStatistic):
         """
         walk = component.variant.design[0]
         if component.candidate.driver:
-            size, _ = _walk_size(component, state, component.variant)
+            size, _ = _walk_size(component, state)
             walk = size**2 * walk
         return replace(state, baseline=with_process(state.baseline, component.row[0], walk))
 
@@ -115,7 +115,7 @@ class RandomProcess(BlockMeanStatistic):
         for component in fit.components:
             (name,) = component.variant.columns
             key = fit.key(name, component.row[0])
-            out[key] = _walk_size(component, fit.state, component.variant)
+            out[key] = _walk_size(component, fit.state)
         return out
 
     def is_modelled_in(self, region: Region, *, together: bool) -> bool:
@@ -187,10 +187,10 @@ def _walk_factors(
     return sizes, np.stack([log_evidence(size**2 * variant.design[0]) - without for size in sizes])
 
 
-def _walk_size(component: Component, state: State, variant: Variant) -> tuple[float, float]:
+def _walk_size(component: Component, state: State) -> tuple[float, float]:
     """Return the size of a walk that follows a channel in calibrated noise, and its error."""
     sizes, factors = _walk_factors(
-        variant, component.row[0], state.blocks, state, _FINE_DECADES, tier="calibrated"
+        component.variant, component.row[0], state.blocks, state, _FINE_DECADES, tier="calibrated"
     )
     return _average_size(sizes, factors)
 
