@@ -346,15 +346,14 @@ def with_noise(identifications: Identifications, baseline: xr.Dataset) -> Identi
 
     A share of N^2 is a share of the new one.
     """
-    blocks = identifications.state.blocks
+    state = replace(identifications.state, baseline=baseline)
     candidates: dict[Candidate, Candidate] = {}  # by the old one
     variants: dict[Variant, Variant] = {}
     for component in components_of(identifications.identified):
         old = component.candidate
         if old.statistic.is_power and old not in candidates:
             made = tuple(
-                rebuild_variant(old, variant, blocks, baseline["coefficient"]) or variant
-                for variant in old.variants
+                rebuild_variant(old, variant, state) or variant for variant in old.variants
             )
             candidates[old] = replace(old, variants=made)
             variants |= zip(old.variants, made, strict=True)

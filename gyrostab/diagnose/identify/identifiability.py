@@ -310,7 +310,7 @@ def passes_time_shift_test(
     real, shifted = 0.0, np.zeros(shifts.size)
     is_similar = np.zeros(shifts.size, np.bool_)
     for component in following_components:
-        surrogates = make_surrogates(component, state.blocks, state.baseline["coefficient"], shifts)
+        surrogates = make_surrogates(component, state, shifts)
         values = _compute_shifted_evidence(component, surrogates, state)
         real += float(values[0])
         shifted += values[1:]

@@ -379,12 +379,7 @@ class _Grid:
         """Add a point of another value to a line; None where the effect cannot have it."""
         sought = replace(like.variant, values={**like.variant.values, self.name: value})
         try:
-            variant = rebuild_variant(
-                self.component.candidate,
-                sought,
-                self.state.blocks,
-                self.state.baseline["coefficient"],
-            )
+            variant = rebuild_variant(self.component.candidate, sought, self.state)
         except OptionError:
             return None
         if variant is None or variant.values.get(self.name) != value:

@@ -17,7 +17,7 @@ from gyrostab.diagnose.predict.candidates import (
     Prospect,
     Variant,
 )
-from gyrostab.diagnose.predict.linear_model import with_correlated_powers
+from gyrostab.diagnose.predict.linear_model import State, with_correlated_powers
 from gyrostab.diagnose.reduce.schema import read_as_measured
 from gyrostab.physics.base import Effect, driver_error
 from gyrostab.physics.prediction import Prediction, Windows
@@ -189,16 +189,13 @@ def driver_names(candidate: Candidate) -> dict[str, str]:
 
 
 def rebuild_variant(
-    candidate: Candidate,
-    variant: Variant,
-    blocks: xr.Dataset,
-    coefficient: xr.DataArray,
-    windows: Windows | None = None,
+    candidate: Candidate, variant: Variant, state: State, windows: Windows | None = None
 ) -> Variant | None:
     """Rebuild a variant for other parameter values or windows; None if it vanishes.
 
     The windows are those of the blocks by default.
     """
+    blocks, coefficient = state.blocks, state.baseline["coefficient"]
     if windows is None:
         windows = make_windows(blocks, driver_names(candidate))
     effect = effects()[candidate.effect].example(**variant.values)
@@ -321,11 +318,9 @@ def weigh_by_time(variants: tuple[Variant, ...], windows: Windows) -> tuple[Vari
     )
 
 
-def make_surrogates(
-    component: Component, blocks: xr.Dataset, coefficient: xr.DataArray, shifts: Ints
-) -> list[Variant | None]:
+def make_surrogates(component: Component, state: State, shifts: Ints) -> list[Variant | None]:
     """Return the variant for channels that are rotated in time by each shift, end to start."""
-    candidate = component.candidate
+    candidate, blocks = component.candidate, state.blocks
     drivers = driver_names(candidate)
     windows = make_windows(blocks, drivers)
     channels = {inner: blocks[f"channel_{name}"].values for inner, name in drivers.items()}
@@ -347,9 +342,7 @@ def make_surrogates(
         return replace(shifted, own=dict(zip(windows.axes, rotated_means, strict=True)))
 
     return [
-        rebuild_variant(
-            candidate, component.variant, blocks, coefficient, shift_windows(int(shift))
-        )
+        rebuild_variant(candidate, component.variant, state, shift_windows(int(shift)))
         for shift in shifts
     ]
 

@@ -124,9 +124,7 @@ def _score_bandwidth(
     variant = component.variant
     if "bandwidth" in variant.values:
         changed = replace(variant, values={**variant.values, "bandwidth": width})
-        coefficient = state.baseline["coefficient"]
-        rebuilt = rebuild_variant(component.candidate, changed, state.blocks, coefficient)
-        variant = rebuilt or variant
+        variant = rebuild_variant(component.candidate, changed, state) or variant
     moments = [
         component_mixture(replace(component, row=row), state, variant).moments() for row in rows
     ]

@@ -150,7 +150,7 @@ class Records:
                     data=course.reshape(BLOCKS, parts, -1).mean(axis=-1).reshape(shape)
                 )
         rebuilt = (
-            rebuild_variant(self.candidate, variant, blocks, self.baseline["coefficient"])
+            rebuild_variant(self.candidate, variant, initial_state(blocks, self.baseline))
             for variant in self.candidate.variants
         )
         candidate = replace(self.candidate, variants=tuple(filter(None, rebuilt)))
