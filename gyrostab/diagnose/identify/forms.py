@@ -38,10 +38,8 @@ def choose_forms(identifications: Identifications, baseline: xr.Dataset) -> Iden
 
     return replace(
         identifications,
-        identified=tuple(
-            with_form(identification) for identification in identifications.identified
-        ),
-        expected=tuple(with_form(identification) for identification in identifications.expected),
+        identified=tuple(map(with_form, identifications.identified)),
+        expected=tuple(map(with_form, identifications.expected)),
     )
 
 
