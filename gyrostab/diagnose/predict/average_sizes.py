@@ -382,7 +382,7 @@ class _Grid:
             variant = rebuild_variant(self.component.candidate, sought, self.state)
         except OptionError:
             return None
-        if variant is None or variant.values.get(self.name) != value:
+        if variant is None:
             return None
         added = _make_point(variant, component_mixture(self.component, self.state, variant), place)
         line.append(added)

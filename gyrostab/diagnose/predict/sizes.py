@@ -130,8 +130,6 @@ def disagreement_nats(size: Floats, weight: Floats) -> float:
 
 
 def component_size(component: Component, state: State) -> tuple[float, float]:
-    """Return size and standard error of the first column; 0 and inf for statistics without size."""
-    if not component.statistic.has_size:
-        return 0.0, np.inf
+    """Return size and standard error of the first column."""
     mean, covariance = component_mixture(component, state).moments()
     return float(mean[0]), float(np.sqrt(covariance[0, 0]))
