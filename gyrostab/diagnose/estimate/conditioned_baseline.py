@@ -95,11 +95,8 @@ def predict_baseline(
     ]
     if not shared:
         return predicted
-    expected = expected_cross(baseline)
-    cross = _cross_spectra(shared, empty_state)
-    return predicted.assign(
-        cross=(("pair", "block", "band"), cross if expected is None else cross + expected)
-    )
+    cross = _cross_spectra(shared, empty_state) + expected_cross(baseline, blocks)
+    return predicted.assign(cross=(("pair", "block", "band"), cross))
 
 
 def _fit_spectrum(state: State, is_left_out: Mapping[tuple[str, str], list[bool]]) -> Floats:

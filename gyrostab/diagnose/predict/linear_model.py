@@ -253,9 +253,10 @@ def cross_column(density: Array, row: int, blocks: xr.Dataset) -> Array:
     return np.asarray(np.broadcast_to(spread_by_gaps(density + 0j, blocks, "pair"), shape)[row])
 
 
-def expected_cross(baseline: xr.Dataset) -> Array | None:
-    """Return the cross-spectra of the baseline, (pair, block, band); None if it has none."""
-    return np.asarray(baseline["cross"].values) if "cross" in baseline else None
+def expected_cross(baseline: xr.Dataset, blocks: xr.Dataset) -> Array:
+    """Return the cross-spectra of the baseline, (pair, block, band); zero if it has none."""
+    source = baseline["cross"] if "cross" in baseline else xr.zeros_like(blocks["cross"])
+    return np.asarray(source.values)
 
 
 def reference_channel_power(name: str, blocks: xr.Dataset) -> Array:

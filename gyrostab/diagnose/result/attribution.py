@@ -18,7 +18,7 @@ from gyrostab.diagnose.identify.selections import Selection, components_of
 from gyrostab.diagnose.nulls.scores import NullScores, standardise
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import drop_changed_tails, find_bands, mean_columns
-from gyrostab.diagnose.predict.linear_model import pair_rows
+from gyrostab.diagnose.predict.linear_model import expected_cross, pair_rows
 from gyrostab.diagnose.reduce.schema import weighted_mean
 from gyrostab.diagnose.result.active_spans import active_spans
 from gyrostab.diagnose.settings import DEFAULTS, Settings
@@ -311,7 +311,7 @@ def _with_shared_lines(
     if len(lines) < 2:
         return after
     observed, shape = (blocks[name].values for name in ("cross", "cross_shape"))
-    expected = after["cross"].values if "cross" in after else np.zeros_like(observed)
+    expected = expected_cross(after, blocks)
     mean, _ = weighted_mean(observed - expected, shape, axis=1)
     cross = expected.copy()
     for place in {place for place, _ in lines}:

@@ -138,8 +138,7 @@ class CrossSpectrum(Statistic):
     ) -> LinearModel:
         pair = pair_rows(state.blocks)[row]
         i, j = (state.axes.index(axis) for axis in pair)
-        expected = expected_cross(state.baseline)
-        shared = expected[row] if expected is not None else np.zeros(1)
+        shared = expected_cross(state.baseline, state.blocks)[row]
         values = records_last(data["cross"].values, 3)[row] - shared[..., None]
         shape = state.blocks["cross_shape"].values[row]
         # The scatter is larger in phase with shared noise, and smaller in quadrature.

@@ -141,8 +141,7 @@ def reference_channel_of(
     if name in axes:
         cross = records_last(read_as_measured(data, "cross").values, 3)
         has_power = np.isfinite(blocks.variables["power"].values[row])[..., None]
-        expected = expected_cross(baseline)
-        cross = cross if expected is None else cross - expected[..., None]
+        cross = cross - expected_cross(baseline, blocks)[..., None]
         cross_power = np.full(cross.shape[1:], np.nan + 0j)
         for number, pair in enumerate(pair_rows(blocks)):
             if set(pair) == {name, axes[row]} and name != axes[row]:
