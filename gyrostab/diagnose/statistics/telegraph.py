@@ -214,7 +214,7 @@ def _with_free_levels(evidence: CandidateEvidence, trial: Trial) -> CandidateEvi
     for row, (axis,) in enumerate(evidence.rows):
         if not np.isfinite(evidence_nats[0, row]):
             continue
-        visits = _compare_visits(_course_of(best[row]), axis, trial.data, trial.state)
+        visits = _compare_visits(_course_of(best[row]), axis, trial.state)
         evidence_nats[0, row] += visits.unequal_nats
         best[row] = replace(
             best[row],
@@ -255,7 +255,7 @@ def _unequal_nats(component: Component, state: State) -> float:
         courses.append((search_block_means(state_tried, axis)[1].share[0], state_tried))
     nats = []
     for share, state_tried in courses:
-        visits = _compare_visits(share, axis, state.blocks, state_tried)
+        visits = _compare_visits(share, axis, state_tried)
         is_known = visits.switch_count >= state.settings.min_switches
         nats.append(visits.unequal_nats if is_known else max(visits.unequal_nats, 0.0))
     return min(nats)
@@ -266,9 +266,9 @@ def _course_of(variant: Variant) -> Floats:
     return variant.inside if variant.inside.size else np.asarray(variant.design[0, 0])
 
 
-def _compare_visits(share: Floats, axis: str, data: xr.Dataset, state: State) -> Visits:
+def _compare_visits(share: Floats, axis: str, state: State) -> Visits:
     return compare_visits(
-        axis_values(data, "mean", axis),
+        axis_values(state.blocks, "mean", axis),
         state.baseline,
         share,
         axis=axis,
