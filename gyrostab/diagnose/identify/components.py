@@ -92,12 +92,11 @@ def merge_lines(components: dict[str, list[Component]]) -> dict[str, list[Compon
     """
     out = {}
     for key, effect_components in components.items():
-        plain = effect_components[0].candidate.effect == PLAIN_LINE
-        remaining = (
-            effect_components
-            if plain
-            else [component for component in effect_components if not component.statistic.is_line]
-        )
+        remaining = [
+            component
+            for component in effect_components
+            if component.candidate.effect == PLAIN_LINE or not component.statistic.is_line
+        ]
         if remaining:
             out[key] = remaining
     return out
@@ -110,11 +109,8 @@ def are_lines(components: Sequence[Component]) -> bool:
 
 def sum_evidence(components: Sequence[Component]) -> float:
     """Return the evidence of an effect from its components [nats]."""
-    return (
-        float(combine_rows(np.array([component.evidence_nats for component in components])))
-        if components
-        else 0.0
-    )
+    nats = [component.evidence_nats for component in components]
+    return float(combine_rows(np.array(nats))) if nats else 0.0
 
 
 def renew_component(component: Component, components: Sequence[Component]) -> Component:
