@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,8 +26,7 @@ from gyrostab.diagnose.predict.linear_model import (
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.diagnose.predict.windows import distinct_variants
 from gyrostab.diagnose.reduce.schema import read_as_measured
-from gyrostab.diagnose.statistics.base import NullDraw, Statistic
-from gyrostab.diagnose.statistics.cross_spectrum import draw_coherency
+from gyrostab.diagnose.statistics.base import Statistic
 from gyrostab.physics.base import Effect
 from gyrostab.physics.prediction import Windows
 from gyrostab.physics.registry import effects
@@ -43,14 +42,6 @@ class Transfer(Statistic):
     error_shows_in = ("transfer",)
     is_power_weighted = True
     is_transfer = True
-
-    def null(self, draw: NullDraw) -> Mapping[str, Array]:
-        if "reference_cross" not in draw.blocks:
-            return {}
-        shape = draw.blocks["shape"].values
-        channel_power = draw.blocks["reference_power"].values
-        size = np.sqrt(draw.power[:, :, None] * channel_power)
-        return {"reference_cross": size * draw_coherency(shape[:, None], size.shape, draw.rng)}
 
     def candidates(
         self,

@@ -201,8 +201,7 @@ def test_blocks_with_few_samples_may_have_repeats():
     )
 
 
-def test_orders_profiles_and_reference_channels_have_the_scatter_of_noise():
-    rng = np.random.default_rng(2)
+def test_orders_and_profiles_have_the_scatter_of_noise():
     seconds = np.arange(36_000) / 10.0
 
     def made(seed: int) -> xr.Dataset:
@@ -211,7 +210,6 @@ def test_orders_profiles_and_reference_channels_have_the_scatter_of_noise():
         ).compute()
         log["ramp"] = ("time", (seconds * 0.3) % 1.0, {"units": "1"})
         log["rotation_rate"] = ("time", np.full(seconds.size, 360.0 * 0.7), {"units": "degree s-1"})
-        log["accel_x"] = ("time", rng.standard_normal(seconds.size), {"units": "g"})
         return reduce_log(log)
 
     records = [made(seed) for seed in range(6)]
@@ -225,7 +223,7 @@ def test_orders_profiles_and_reference_channels_have_the_scatter_of_noise():
             )
         )
     )
-    for name, rel in (("order", 0.08), ("profile", 0.05), ("reference_cross", 0.1)):
+    for name, rel in (("order", 0.08), ("profile", 0.05)):
         squares = np.concatenate([np.abs(record[name].values.ravel()) ** 2 for record in records])
         other = np.abs(nulls[name].values) ** 2
         assert np.nanmean(squares) == pytest.approx(np.nanmean(other), rel=rel), name
