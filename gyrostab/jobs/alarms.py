@@ -105,7 +105,7 @@ def parse_alarm(text: str) -> Alarm:
     if expected is not None and unit.replace(" ", "") != expected:
         raise OptionError(
             f"--alarm {text!r}: the limit of {name} needs the unit {expected!r}; "
-            f"write {name}{sign}{limit} {expected}"
+            + (f"convert it from {unit}" if unit else f"write {name}{sign}{limit} {expected}")
             if expected
             else f"--alarm {text!r}: {name} has no unit; write {name}{sign}{limit}"
         )

@@ -303,7 +303,8 @@ def test_a_channel_of_an_unknown_quantity_has_alarms_in_its_own_unit(units):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("N>0.01", "needs the unit 'deg/sqrt(h)'"),
+        ("N>0.01", "needs the unit 'deg/sqrt(h)'; write N>0.01 deg/sqrt(h)"),
+        ("N>0.6 deg/h/sqrt(Hz)", "needs the unit 'deg/sqrt(h)'; convert it from deg/h/sqrt(Hz)"),
         ("N=3 deg/sqrt(h)", "write NAME>LIMIT UNIT"),
         ("misfit>3 deg", "has no unit"),
         ("x:temperature>3 degC", "has no axis"),
