@@ -185,7 +185,7 @@ def survey_terms(
         _describe_origin(product, times, statistic),
         (
             _CONFIRM,
-            *_note_ramps(summaries, times),
+            *_note_ramps(product, summaries, times),
             *_make_notes(product, terms, times["section"], content),
         ),
     )
@@ -312,8 +312,15 @@ def _find_ranges(product: xr.Dataset) -> dict[str, tuple[float, float, str]]:
     }
 
 
-def _note_ramps(summaries: Iterable[TermSummary], times: Mapping[str, float]) -> list[str]:
+def _note_ramps(
+    product: xr.Dataset, summaries: Iterable[TermSummary], times: Mapping[str, float]
+) -> list[str]:
     """Say by how much observed rate ramps change the bias, as no term includes them."""
+    if product.attrs.get("variance") == "hadamard":
+        return [
+            "A rate ramp R is in no term, and the Hadamard variance does not show it: make the "
+            "product again with --variance avar to see whether there is one."
+        ]
     hours = (times["section"] + times["calibration"]) / 2.0 / HOUR
     return [
         f"R of axis {summary.axis} ({summary.value:.3g} {summary.unit}) is in no term: such a ramp "

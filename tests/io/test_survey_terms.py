@@ -137,6 +137,10 @@ def test_a_ramp_that_is_observed_is_named_with_the_change_of_the_bias():
     (note,) = (note for note in survey_terms(product, **TIMES).notes if "ramp" in note)
     assert note.startswith("R of axis z (6 deg/h^2) is in no term")
     assert " by 9 deg/h " in note  # 6 deg/h^2 over the 1.5 h between the middles
+    product["observable"].loc[{"term": "R"}] = OBSERVABLE.index("not_observable")
+    assert not any("ramp" in note for note in survey_terms(product).notes)
+    product.attrs["variance"] = "hadamard"  # blind to a ramp
+    assert any("ramp R is in no term, and" in note for note in survey_terms(product).notes)
 
 
 def test_term_that_no_window_shows_is_named_and_has_no_value():
