@@ -119,11 +119,12 @@ def judge_product(product: xr.Dataset) -> list[str]:
     2
     """
     check_product(product)
+    longest_tau = float(product["tau"][-1])
     product = product.drop_dims("tau").compute()
     changes, absences = _compare_channels(product)
     return [
         _judge_sampling(product) or _judge_changes(product, changes),
-        _judge_terms(product, absences),
+        _judge_terms(product, absences, longest_tau),
     ]
 
 
@@ -282,7 +283,9 @@ def _judge_steadiness(product: xr.Dataset) -> str:
     )
 
 
-def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]) -> str:
+def _judge_terms(
+    product: xr.Dataset, absences: dict[tuple[str, str], list[str]], longest_tau: float
+) -> str:
     """Say which terms no axis observes more often than by chance, and which windows would."""
     terms = _fitted_terms(product)
     observed_share = (product["observable"] == OBSERVED).mean("time").max("axis")
@@ -302,11 +305,17 @@ def _judge_terms(product: xr.Dataset, absences: dict[tuple[str, str], list[str]]
     white = float(product["N"].where(product["observable"].sel(term="N") == OBSERVED).median())
     if hidden == ["Q"]:
         return f"{text}: N hides it; a higher sampling rate would show it."
+    slow = join_words([term for term in hidden if term != "Q"])
+    fit_end = float(product.attrs.get("fit_tau_max_s", longest_tau))
+    if fit_end < longest_tau:
+        return (
+            f"{text}: the fit ends at an averaging time of {fit_end:.3g} s (tau_max, --fit-to); "
+            f"longer ones may show {slow}."
+        )
     bounds = product["time"].values[[0, -1]]
     span = float((bounds[1] - bounds[0]) / np.timedelta64(1, "s")) + np.nan_to_num(window)
     longer = [length for length in SUGGESTED_WINDOWS_S if window < length <= span / 4]
     if not longer:
-        slow = join_words([term for term in hidden if term != "Q"])
         return f"{text}; only a longer record could show {slow}."
     limits = smallest_observable(longer[-1], white)
     is_allan = product.attrs.get("variance", "avar") == "avar"  # which the limits are for

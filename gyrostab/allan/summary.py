@@ -245,11 +245,7 @@ def format_product(product: xr.Dataset) -> str:
     lines = [f"Noise coefficients{over} (<: 95 % upper limit)", ""]
     rows = [("axis", "term", *columns, "unit", "observed in")]
     for term in summarise_terms(product):
-        spread = ""
-        if term.status == "observed" and windows > 1:
-            spread = f"{_number_text(term.low)} to {_number_text(term.high)}"
-        elif term.status == "observed":
-            spread = _number_text(float(product[f"{term.symbol}_stderr"].sel(axis=term.axis)[0]))
+        spread = describe_spread(product, term) if term.status == "observed" else ""
         sign = "< " if term.status == "upper_limit_only" else ""
         rows.append(
             (
@@ -267,6 +263,13 @@ def format_product(product: xr.Dataset) -> str:
         for row in rows
     ]
     return "\n".join([*lines, "", *describe_record(product), *judge_product(product)])
+
+
+def describe_spread(product: xr.Dataset, term: TermSummary) -> str:
+    """Return the range of a term over the windows, or its standard error in a single window."""
+    if product.sizes["time"] > 1:
+        return f"{_number_text(term.low)} to {_number_text(term.high)}"
+    return _number_text(float(product[f"{term.symbol}_stderr"].sel(axis=term.axis)[0]))
 
 
 def describe_record(product: xr.Dataset) -> list[str]:

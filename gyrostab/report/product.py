@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,7 +82,7 @@ def write_report(
         if windows[1] < times[0] or times[1] < windows[0]:
             raise SchemaError(f"the log holds no window: {describe_times(log, product)} (--log)")
     from gyrostab.allan.judgement import judge_product
-    from gyrostab.allan.summary import summarise_terms
+    from gyrostab.allan.summary import describe_spread, summarise_terms
 
     terms = summarise_terms(product)
     axes = dict.fromkeys(term.axis for term in terms)
@@ -97,6 +98,8 @@ def write_report(
             findings=_describe_findings(product, table),
             facts=_list_facts(product),
             table=table,
+            is_single=product.sizes["time"] == 1,
+            spread=partial(describe_spread, product),
             laws=LAWS,
             number=_number_text,
             share=format_share,

@@ -138,6 +138,15 @@ def test_unobserved_terms_come_with_a_longer_window_or_a_longer_record():
     assert "sampling rate" in judge_product(_make_product({"Q": UPPER_LIMIT_ONLY}))[1]
 
 
+def test_a_fit_that_ends_early_is_the_reason_that_is_given():
+    product = _make_product({"B": UPPER_LIMIT_ONLY, "K": NOT_OBSERVABLE})
+    product.attrs["fit_tau_max_s"] = float(product["tau"][2])
+    assert judge_product(product)[1].endswith(
+        f": the fit ends at an averaging time of {product['tau'].values[2]:.3g} s "
+        "(tau_max, --fit-to); longer ones may show B and K."
+    )
+
+
 def test_terms_observed_as_often_as_by_chance_count_as_unobserved():
     product = _make_product({"B": UPPER_LIMIT_ONLY}).isel(time=np.zeros(60, dtype=int))
     product["time"] = np.datetime64("2026-03-14", "ns") + np.arange(60) * np.timedelta64(10, "m")

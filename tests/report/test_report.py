@@ -161,6 +161,18 @@ def test_one_window_without_an_estimate_makes_a_page(tmp_path):
     assert "surface" not in page.ids  # of a single window
 
 
+@pytest.mark.usefixtures("without_figures")
+def test_a_single_window_has_standard_errors_instead_of_a_range(tmp_path):
+    product = synthetic.product(axes="x").isel(time=[2])
+    product["N_stderr"] = product["N"] * 0.0 + 0.00123
+    page = read(write_report(product, tmp_path / "report.html"))
+    (row,) = (row for row in page.rows if row[1:2] == ["N, angle random walk"])
+    assert float(row[2]) == pytest.approx(float(product["N"][0, 0]), rel=0.01)
+    assert row[3] == "0.00123"
+    assert "Standard error" in page.text
+    assert "5 % to 95 %" not in page.text
+
+
 def test_existing_report_and_wrong_input_are_refused(tmp_path):
     path = tmp_path / "report.html"
     path.write_text("old")
