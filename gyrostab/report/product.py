@@ -152,9 +152,10 @@ def _summarise_record(product: xr.Dataset) -> str:
     speed = f" at {float(rate):g} Hz" if rate is not None else ""
     axis_text = f"{len(axes)} gyro {'axes' if len(axes) != 1 else 'axis'} ({', '.join(axes)})"
     length = format_duration(float((end - start) / np.timedelta64(1, "s")), " ")
+    windows = product.sizes["time"]
     return (
         f"{axis_text}{speed}{origin}, {length} from {_stamp_text(start)} to {_stamp_text(end)} "
-        f"UTC, analysed in {product.sizes['time']} windows."
+        f"UTC, analysed in {windows} window{'s' * (windows != 1)}."
     )
 
 
@@ -173,7 +174,7 @@ def _describe_findings(
             if np.isfinite(term.median)
         ]
         text = (
-            f"Axis {axis}, medians: {', '.join(medians)}."
+            f"Axis {axis}{', medians' * (product.sizes['time'] > 1)}: {', '.join(medians)}."
             if medians
             else f"Axis {axis}: no coefficient is observed in any window."
         )

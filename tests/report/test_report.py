@@ -169,6 +169,8 @@ def test_a_single_window_has_standard_errors_instead_of_a_range(tmp_path):
     (row,) = (row for row in page.rows if row[1:2] == ["N, angle random walk"])
     assert float(row[2]) == pytest.approx(float(product["N"][0, 0]), rel=0.01)
     assert row[3] == "0.00123"
+    assert "analysed in 1 window." in page.text
+    assert "medians" not in page.text
     assert "Standard error" in page.text
     assert "5 % to 95 %" not in page.text
 
