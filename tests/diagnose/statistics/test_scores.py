@@ -192,7 +192,9 @@ def test_detection_limit_of_shared_noise(base, null):
 def test_detection_limit_of_a_line(base, null):
     def line(blocks, amplitude):
         signal, rng = amplitude**2 / 4.0 * 0.926 * BLOCK_S, np.random.default_rng(2)
-        sine = np.sqrt(signal) * np.exp(2j * np.pi * rng.random((60, 8, 23)))
+        parts = blocks.sizes["part"]
+        shape = (blocks.sizes["record"], parts, blocks.sizes["block"] // parts)
+        sine = np.sqrt(signal) * np.exp(2j * np.pi * rng.random(shape))
         noise = np.sqrt(LEVEL / 2.0) * (
             rng.normal(size=sine.shape) + 1j * rng.normal(size=sine.shape)
         )
