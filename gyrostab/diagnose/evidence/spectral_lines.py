@@ -11,7 +11,7 @@ from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.kernels.spectra.line_levels import EDGE_LINES, LEAK_LINES, level_around, local_level
 
-#: Parts of a record in which a steady line is judged. Design choice.
+#: Parts of a record in which a steady line, or a steady change of level, is judged. Design choice.
 JUDGED_PARTS = 8
 _MIN_LEVEL_RATIO = 1e-3  # of the spectrum, that known lines leave; design choice
 _MAX_SKIRT_LINES = 40  # design choice

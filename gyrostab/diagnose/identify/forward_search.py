@@ -188,8 +188,8 @@ def _select_next(
     """Select the next effect or pair of effects, or the nuisance alternative that explains more.
 
     Effects that another form beats are added to `beaten`. The second result is by how much a
-    time-shifted channel explains more than each effect that fails this test; nothing is selected if
-    no effect passes but these.
+    time-shifted channel explains more than each effect that fails this test. If all effects that
+    pass otherwise fail it, or none passes, the list of selections is empty.
     """
     settings = examination.settings
     components = merge_lines(group_components(all_evidence, settings=settings))

@@ -11,7 +11,7 @@ import xarray as xr
 
 from gyrostab.arrays import Floats, Ints
 from gyrostab.diagnose.evidence.held_out import LinearModel, noise_columns, with_independent_cells
-from gyrostab.diagnose.evidence.spectral_lines import expected_lines
+from gyrostab.diagnose.evidence.spectral_lines import JUDGED_PARTS, expected_lines
 from gyrostab.diagnose.predict.candidates import (
     Candidate,
     Component,
@@ -45,7 +45,6 @@ from gyrostab.physics.registry import effects
 
 #: Columns of the score that show another level of the noise.
 LEVEL_COLUMNS = ("avar", "level")
-_PARTS = 8  # of a record in which a steady effect has one size; design choice
 _MAX_INTERVALS = 240  # intervals of a burst that are tried; limits time
 
 
@@ -236,7 +235,7 @@ def parts_of_record(component: Component, state: State) -> Iterator[Competitor]:
     size, error = np.array(
         [
             _fit_part(component, state, inside)
-            for inside in np.array_split(np.arange(state.blocks.sizes["block"]), _PARTS)
+            for inside in np.array_split(np.arange(state.blocks.sizes["block"]), JUDGED_PARTS)
         ]
     ).T
     weight = np.where(np.isfinite(size) & np.isfinite(error) & (error > 0.0), error, np.inf) ** -2.0

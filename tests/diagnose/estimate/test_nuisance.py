@@ -24,7 +24,7 @@ def noise_only():
     return blocks, calibrate_noise(blocks)
 
 
-def _variant(component, values):
+def _find_variant(component, values):
     return next(
         variant
         for variant in component.candidate.variants
@@ -40,11 +40,11 @@ def fit_effect(noise_only, effect, statistic, column, *, true, size, named):
     blocks, baseline = noise_only
     identifications = identify_by_hand(blocks, baseline, effect, statistic, (column,))
     component = identifications.identified[0].components[0]
-    design = _variant(component, true).design
+    design = _find_variant(component, true).design
     size = size if statistic == "mean" else size**2
     added = size * np.stack([design[0, 0], 0 * design[0, 0], 0 * design[0, 0]])
     changed = blocks.assign({statistic: blocks[statistic] + added})
-    component = replace(component, variant=_variant(component, named))
+    component = replace(component, variant=_find_variant(component, named))
     identification = replace(identifications.identified[0], components=(component,))
     state = condition_on(initial_state(changed, baseline), [component])
     (fitted,) = fit_identifications(
