@@ -44,7 +44,8 @@ def plot_coefficients(
     """Draw Q, N, B, K and R over time, one panel per coefficient.
 
     Bands or bars are standard errors, arrows pointing down are 95 % upper limits. Grey spans are
-    those where the coefficient is not observable; darker grey, on more axes.
+    those where the coefficient is not observable; darker grey, on more axes. An axis without any
+    coefficient is named so in the legend, and leaves the panels of the others white.
 
     Parameters
     ----------
@@ -78,18 +79,19 @@ def plot_coefficients(
     panels = figure.subplots(len(LAWS), 1, sharex=True)
     time = product["time"].values
     edges = find_time_edges(time)
+    shaded = _axes_to_shade(product, names)
     for panel, (symbol, law) in zip(panels, LAWS.items(), strict=True):
         for name in names:
             _draw_axis(panel, product.sel(axis=name), symbol, name, axis_style(product, name))
             hidden = product["observable"].sel(axis=name, term=symbol).values == NOT_OBSERVABLE
-            if hidden.any():
+            if hidden.any() and name in shaded:
                 first, last = find_true_runs(hidden)
-                shade_spans(panel, edges[first], edges[last], alpha=0.6 / len(names))
+                shade_spans(panel, edges[first], edges[last], alpha=0.6 / len(shaded))
         _set_scale(panel, product, symbol, names)
         panel.set_ylabel(f"{symbol} {unit_label(law.label)}")
         panel.set_title(_title_panel(product, symbol, names), loc="left", pad=3, y=1.0)
         panel.grid(alpha=0.3)
-    keys = _legend_handles(product, names)
+    keys = _legend_handles(product, names, shaded)
     figure.legend(
         handles=keys,
         loc="outside lower center",
@@ -101,6 +103,13 @@ def plot_coefficients(
     time_axis(panels[-1], edges)
     figure.align_ylabels()
     return figure
+
+
+def _axes_to_shade(product: xr.Dataset, names: list[str]) -> list[str]:
+    """List the axes of which a window observes a term or limits it, or all if there are none."""
+    state = product["observable"].sel(axis=names, term=list(LAWS))
+    has_any = (state != NOT_OBSERVABLE).any(("time", "term")).values
+    return [name for name, is_alive in zip(names, has_any, strict=True) if is_alive] or names
 
 
 def _title_panel(product: xr.Dataset, symbol: str, names: list[str]) -> str:
@@ -171,13 +180,19 @@ def find_shown_values(product: xr.Dataset, symbol: str) -> Array:
     return np.asarray(numbers[np.isfinite(numbers) & (numbers > 0)])
 
 
-def _legend_handles(product: xr.Dataset, names: list[str]) -> list[Any]:
+def _legend_handles(product: xr.Dataset, names: list[str], shaded: list[str]) -> list[Any]:
     """List the axes, and of the other marks those that a panel shows."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     keys: list[Any] = [
-        Line2D([], [], **axis_style(product, name), label=f"axis {name}", markersize=4.0)
+        Line2D(
+            [],
+            [],
+            **axis_style(product, name),
+            label=f"axis {name}" + ": not observable" * (name not in shaded),
+            markersize=4.0,
+        )
         for name in names
     ]
     state = product["observable"].sel(axis=names, term=list(LAWS)).values
@@ -187,6 +202,6 @@ def _legend_handles(product: xr.Dataset, names: list[str]) -> list[Any]:
     if (state == UPPER_LIMIT_ONLY).any():
         limit = {"marker": upper_limit_marker(), "markerfacecolor": "none"}
         keys.append(Line2D([], [], **mark, **limit, label="95 % upper limit"))
-    if (state == NOT_OBSERVABLE).any():
+    if (product["observable"].sel(axis=shaded, term=list(LAWS)) == NOT_OBSERVABLE).any():
         keys.append(Patch(facecolor=GREY, alpha=0.5, label="not observable"))
     return keys

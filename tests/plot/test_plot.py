@@ -236,6 +236,29 @@ def test_values_limits_and_unobservable_spans_of_the_coefficients(windows):
     assert windows == 40 or lone
 
 
+def test_axis_without_coefficients_leaves_the_panels_of_the_others_white(product):
+    def legend(figure):
+        return [text.get_text() for text in figure.legends[0].get_texts()]
+
+    alone = plot_coefficients(product.sel(axis=["x", "z"]))
+    dead = product.copy(deep=True)
+    row = {"axis": list(dead.axis.values).index("y")}
+    dead.observable[row] = 0
+    for name in [name for name in dead.data_vars if name.partition("_")[0] in LAWS]:
+        dead[name][row] = np.nan
+    figure = plot_coefficients(dead)
+    for ax, expected in zip(figure.axes, alone.axes, strict=True):
+        assert [bar.get_alpha() for bar in shaded(ax)] == [
+            bar.get_alpha() for bar in shaded(expected)
+        ]
+        assert [len(bar.get_paths()) for bar in shaded(ax)] == [
+            len(bar.get_paths()) for bar in shaded(expected)
+        ]
+    assert legend(figure)[:3] == ["axis x", "axis y: not observable", "axis z"]
+    # the figure of this axis alone is grey
+    assert all(len(shaded(ax)) == 1 for ax in plot_coefficients(dead, axis="y").axes)
+
+
 def test_standard_errors_are_drawn(product):
     panel = plot_coefficients(product, axis="x").axes[1]
     bars = next(item for item in panel.collections if item.__class__.__name__ == "LineCollection")
