@@ -13,7 +13,7 @@ import xarray as xr
 
 from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.correlate.dataset import check_names, make_coupling_dataset
-from gyrostab.correlate.drivers import Driver, align_drivers, other_channels
+from gyrostab.correlate.drivers import Driver, align_drivers, other_channels, suggest_channels
 from gyrostab.correlate.fit import (
     SIGNIFICANCE,
     Blocks,
@@ -148,8 +148,7 @@ def correlate(
                 rows = np.stack([series[place] for place in places])
                 fitted = fit_driver(find_blocks(*key), rows, used, other_series, lag_times, level)
                 entries |= {(*place, d): entry for place, entry in zip(places, fitted, strict=True)}
-        if len(channels) > 1:
-            _note_empty_drivers(drivers)
+        _note_empty_drivers(product, drivers, is_single=len(channels) == 1)
         for (a, v), row in series.items():
             of_series = [entries[a, v, d] for d in range(len(drivers))]
             shared = known[["best" in entry for entry in of_series]].all(axis=0)
@@ -279,15 +278,20 @@ def _known_windows(drivers: list[Driver]) -> tuple[Bools, Ints]:
     return is_known[np.arange(len(drivers)), counts - 1], counts
 
 
-def _note_empty_drivers(drivers: list[Driver]) -> None:
-    """Warn of drivers that have no value, which the effects of the others cannot be given."""
-    for driver in drivers:
-        if not np.isfinite(driver.values).any():
-            warnings.warn(
-                f"{driver.label} has no value in any window, so it is left out: the effects of the "
-                "other drivers are estimated without it",
-                stacklevel=3,
-            )
+def _note_empty_drivers(product: xr.Dataset, drivers: list[Driver], *, is_single: bool) -> None:
+    """Warn of drivers without any value: effects of the others are estimated without them.
+
+    `is_single` says that the drivers are one channel and its rate of change.
+    """
+    for driver in drivers[:1] if is_single else drivers:
+        if np.isfinite(driver.values).any():
+            continue
+        note = (
+            f" of the product; {suggest_channels(product, driver.name)}"
+            if is_single
+            else ", so it is left out: the effects of the other drivers are estimated without it"
+        )
+        warnings.warn(f"{driver.label} has no value in any window{note}", stacklevel=3)
 
 
 def _adjust_p_values(entries: dict[tuple[int, int, int], dict[str, Any]]) -> None:

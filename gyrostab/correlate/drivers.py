@@ -87,12 +87,9 @@ def _align_channel(
     """Average a channel and its rate of change over the windows, for every lag."""
     if isinstance(channel, str):
         if channel not in product.data_vars or product[channel].dims != ("time",):
-            available = ", ".join(_channel_names(product))
+            missing = f" {channel!r}" if _channel_names(product) else "s"
             raise OptionError(
-                f"the product has no channel {channel!r}; it has {available}; give another, or a "
-                "file with --channel"
-                if available
-                else "the product has no channels; give a file with --channel"
+                f"the product has no channel{missing}; {suggest_channels(product, channel)}"
             )
         name = channel
         factor, offset, units = _convert_units(product[channel], f"product[{channel!r}]")
@@ -150,6 +147,18 @@ def other_channels(product: xr.Dataset, drivers: Sequence[Driver]) -> list[str]:
     bare = {driver.name.removesuffix("_of_file").removesuffix("_rate") for driver in drivers}
     excluded = bare | {f"{name}_rate" for name in bare} | {driver.name for driver in drivers}
     return [name for name in _channel_names(product) if name not in excluded]
+
+
+def suggest_channels(product: xr.Dataset, unusable: str) -> str:
+    """Say which channels of the product could be given instead of one that cannot be used."""
+    usable = [
+        name
+        for name in _channel_names(product)
+        if name not in (unusable, f"{unusable}_rate") and np.isfinite(product[name].values).any()
+    ]
+    if not usable:
+        return "give a file with --channel"
+    return f"it has {', '.join(usable)}; give another, or a file with --channel"
 
 
 def _channel_names(product: xr.Dataset) -> list[str]:

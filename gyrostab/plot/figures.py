@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import xarray as xr
 
 from gyrostab.correlate import correlate
@@ -30,8 +31,8 @@ def product_figures(
     """List the figures of a product by name, as functions that draw them in a width [mm].
 
     They are ``coefficients``, ``davar``, ``davar_change``, ``temperature`` if the product holds
-    one, and for each axis ``adev_<axis>`` and ``davar_3d_<axis>`` (the latter only with at least
-    two windows and two averaging times).
+    values of one, and for each axis ``adev_<axis>`` and ``davar_3d_<axis>`` (the latter only with
+    at least two windows and two averaging times).
     """
     product = with_axis(product)
     check_product(product)
@@ -40,7 +41,8 @@ def product_figures(
         "davar": partial(plot_davar, product),
         "davar_change": partial(plot_davar, product, relative=True),
     }
-    if "temperature" in product and product["temperature"].dims == ("time",):
+    temperature = product.get("temperature", xr.DataArray(np.nan))
+    if temperature.dims == ("time",) and np.isfinite(temperature).any():
         figures["temperature"] = partial(_plot_temperature, product)
     for axis in axis_names(product):
         figures[f"adev_{axis}"] = partial(plot_adev, product, axis)

@@ -222,6 +222,20 @@ def test_a_driver_without_any_value_is_named_and_left_out():
     assert "pressure has no value" in str(correlation["statement"].sel(driver="pressure").values)
 
 
+def test_a_single_channel_without_any_value_is_named_with_the_usable_ones():
+    product = shaken_product(slope=0.3)
+    product["pressure"] = (product["vibration"] * np.nan).assign_attrs(units="Pa")
+    product["temperature"][:] = np.nan
+    with pytest.warns(UserWarning, match="no value") as caught:
+        gyrostab.correlate(product, variables="window_mean", max_lag=0)
+    assert [str(warning.message) for warning in caught] == [
+        "temperature has no value in any window of the product; it has vibration; give another, or "
+        "a file with --channel"
+    ]
+    with pytest.raises(OptionError, match="no channel 'power'; it has vibration; give another"):
+        gyrostab.correlate(product.drop_vars(["temperature", "temperature_rate"]), channel="power")
+
+
 def test_rate_of_change_is_a_driver_only_if_it_is_named_with_others():
     product = shaken_product().drop_vars("temperature_rate")
     correlation = gyrostab.correlate(
@@ -471,7 +485,8 @@ def test_statement_gives_the_reason_why_a_record_cannot_tell():
     still = gyrostab.correlate(absent, variables="window_mean")
     assert str(still["statement"].values[0, 0, 0]).endswith("window mean of axis x is constant.")
     absent["temperature"][:] = np.nan
-    unknown = gyrostab.correlate(absent, variables="window_mean", channel="temperature")
+    with pytest.warns(UserWarning, match="temperature has no value in any window of the product"):
+        unknown = gyrostab.correlate(absent, variables="window_mean", channel="temperature")
     assert "temperature has no value in any window" in str(unknown["statement"].values[0, 0, 0])
     rise = gyrostab.correlate(
         coupled.product(heat="rise", slope=1.0, noises="white"), variables="window_mean", max_lag=0
