@@ -176,7 +176,8 @@ def given_quiescent_blocks(
     """Return the blocks (axis, block) given as quiescent by the user, if they can be used.
 
     None without `quiet`, and, with a warning, where its whole blocks hold fewer than 100 samples or
-    no spectrum: the diagnosis then continues without it.
+    no spectrum: the diagnosis then continues without it. A span that extends beyond the record by a
+    block or more is used as far as the record goes, with a warning.
 
     Raises
     ------
@@ -190,6 +191,8 @@ def given_quiescent_blocks(
     if array.ndim not in (1, 2) or array.shape[-1] != 2:
         raise OptionError(f"quiet={quiet!r}: give (start, end), or a list of such pairs")
     begin, end = blocks["begin"].values, blocks["end"].values
+    record_end = _seconds_since_start(blocks, blocks.attrs["end"])
+    step = float(blocks.attrs["block_s"])
     chosen = np.zeros(n, np.bool_)
     for pair in [quiet] if array.ndim == 1 else list(quiet):
         low, high = (_seconds_since_start(blocks, edge) for edge in pair)
@@ -197,6 +200,13 @@ def given_quiescent_blocks(
             raise OptionError(
                 f"quiet: {low:g} s to {high:g} s after the start is outside of the "
                 f"{_record_length(blocks):g} s of the record, or ends before it starts"
+            )
+        if low <= -step or high >= record_end + step:
+            warnings.warn(
+                f"the time given with --quiet, {low:g} s to {high:g} s after the start, extends "
+                f"beyond the record, which goes from {blocks.attrs['start']} to "
+                f"{blocks.attrs['end']} ({record_end:g} s); it is used as far as the record goes",
+                stacklevel=2,
             )
         chosen |= (begin >= low - 1e-6) & (end <= high + 1e-6)
     if not _is_usable(blocks, chosen, settings.min_quiescent_blocks):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -174,6 +176,28 @@ def test_a_quiet_time_that_is_lost_is_ignored_with_a_note():
     with pytest.warns(UserWarning, match="too few samples without losses for a spectrum.*ignored"):
         baseline = calibrate_noise(blocks, quiet=(0.0, 60.0))
     assert baseline.attrs["calibrated_on"] == calibrate_noise(blocks).attrs["calibrated_on"]
+
+
+@pytest.mark.parametrize(
+    ("quiet", "same", "is_noted"),
+    [
+        ((900.0, 4000.0), (900.0, 1800.0), True),
+        (("1969-12-31T23:00", "1970-01-01T00:10"), (0.0, 600.0), True),
+        ((900.0, 1800.0), (900.0, 1800.0), False),
+        (("1970-01-01T00:00", "1970-01-01T00:30:01"), (0.0, 1800.0), False),
+    ],
+)
+def test_a_quiet_time_beyond_the_record_is_used_within_it_with_a_note(quiet, same, is_noted):
+    blocks = reduce_log(log({"N": 0.003}, duration="30min"))
+    expected = given_quiescent_blocks(blocks, same)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        np.testing.assert_array_equal(given_quiescent_blocks(blocks, quiet), expected)
+    notes = [str(warning.message) for warning in caught]
+    assert bool(notes) == is_noted
+    assert all(
+        "extends beyond the record, which goes from 1970-01-01T00:00:00" in note for note in notes
+    )
 
 
 @pytest.mark.parametrize(
