@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Container
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from gyrostab.ingest.formats.text import matches as is_text_log
 from gyrostab.ingest.limits import check_declared
 from gyrostab.schema import SIGNAL_UNITS, check_log, check_product, check_surface
 from gyrostab.store.cf import find_kind, from_disk
+from gyrostab.store.output import read_json
 from gyrostab.store.read import open_stored
 
 
@@ -199,13 +201,37 @@ def _restore_log(log: xr.Dataset, path: str | os.PathLike[str]) -> xr.Dataset:
 
 
 def _open_binary(path: str | os.PathLike[str], text_advice: str, *, strict: bool) -> xr.Dataset:
-    """Open a dataset; of a text file, say that it is one."""
+    """Open a dataset; of a text file or an output of another command, say that it is one."""
     try:
         return open_dataset(path, strict=strict)
     except DamageError as error:
+        _refuse_other_output(Path(path), error)
         if not is_text_log(Path(path)):
             raise
         raise FormatError(f"{path}: is a text file{text_advice}") from error
+
+
+def _refuse_other_output(path: Path, cause: Exception, dims: Container[Any] = ()) -> None:
+    """Raise `FormatError` if this is a diagnosis, a fleet or a part of one: say what reads it."""
+    marks = [path] if path.suffix == ".json" else [path / "diagnosis.json", path / "fleet.json"]
+    contents = (read_json(mark) for mark in marks)
+    schemas = [str(content.get("schema")) for content in contents if isinstance(content, dict)]
+    if any(schema.startswith("gyrostab.diagnosis/") for schema in schemas) or (
+        "case" in dims and "window" in dims
+    ):
+        is_folder = path.is_dir()
+        folder = path if is_folder else path.parent
+        raise FormatError(
+            f"{path}: is {'' if is_folder else 'a file of '}a diagnosis; "
+            f"'gyrostab report {folder} -o report.html' draws its figures, and "
+            "gyrostab.open_diagnosis opens its folder"
+        ) from cause
+    if any(schema.startswith("gyrostab.fleet/") for schema in schemas):
+        raise FormatError(
+            f"{path}: is the output of 'gyrostab fleet'; its report is index.html in this folder; "
+            "give the product of one of its runs, or the whole fleet to "
+            "'gyrostab export --format iscwsa'"
+        ) from cause
 
 
 def _open_path(
@@ -219,6 +245,7 @@ def _open_path(
     except SchemaError as error:
         kind = find_kind(dataset)
         dataset.close()
+        _refuse_other_output(Path(path), error, dims=dataset.sizes)
         # a product with a fault passes as a surface
         if kind != "dataset" and not (kind == "surface" and "observable" in dataset):
             raise FormatError(f"{path}: holds a {kind}, not {content}; {advice}") from error

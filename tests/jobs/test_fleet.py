@@ -188,6 +188,9 @@ def test_a_zarr_store_holds_the_same_products(archive, done, tmp_path):
     expected = open_product(done / "tool 1" / "run a.nc")
     xr.testing.assert_equal(open_product(output / "run a"), expected)
     np.testing.assert_array_equal(tree["run a"]["N"].values, expected["N"].values)
+    for fleet in (output, done):
+        with pytest.raises(FormatError, match=r"is the output of 'gyrostab fleet'.*index\.html"):
+            open_product(fleet)
 
 
 def test_the_table_has_a_row_for_each_run(done):

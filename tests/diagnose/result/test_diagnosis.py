@@ -248,6 +248,23 @@ def test_folder_of_four_files_round_trips(tmp_path: Path):
 
 
 @plain_pages
+def test_commands_for_products_name_the_command_for_a_diagnosis(tmp_path: Path, capsys):
+    folder = tmp_path / "found"
+    write_diagnosis(diagnosis(), folder)
+    (tmp_path / "moved.nc").write_bytes((folder / "diagnosis.nc").read_bytes())
+    for path in (folder, folder / "diagnosis.nc", folder / "diagnosis.json"):
+        assert call("plot", path, "-o", tmp_path / "figures") == 2
+        shown = capsys.readouterr().err
+        assert f"{path}: is a" in shown
+        assert f"diagnosis; 'gyrostab report {folder} -o report.html' draws its figures" in shown
+    for path in (folder / "diagnosis.nc", tmp_path / "moved.nc"):
+        assert call("report", path, "-o", tmp_path / "report.html") == 2
+        assert f"{path}: is a file of a diagnosis" in capsys.readouterr().err
+    assert call("fit", folder / "diagnosis.nc", "-o", tmp_path / "product.nc") == 2
+    assert "is a file of a diagnosis" in capsys.readouterr().err
+
+
+@plain_pages
 def test_a_file_name_that_is_no_text_is_replaced(tmp_path: Path):
     made = {**content(), "recording": {**content()["recording"], "files": ["a\udcff\x01.csv"]}}
     write_diagnosis(Diagnosis(to_json_types(made), surfaces(), model()), tmp_path / "found")
