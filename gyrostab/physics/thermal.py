@@ -49,7 +49,7 @@ class TemperatureBias(Effect):
     Examples
     --------
     >>> TemperatureBias(sensitivity=0.002, axes=["x"]).say()
-    'The bias follows the temperature on axis x, by 0.002 deg/h/degC around 25 degC.'
+    'The bias follows the temperature on axis x, by 0.002 deg/h/degC.'
     """
 
     name = "temperature_bias"
@@ -99,7 +99,9 @@ class TemperatureBias(Effect):
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
         terms = [self.quantity(name, errors) for name in self.list_sizes() or ("sensitivity",)]
-        size = f"{', '.join(terms)} around {self.quantity('reference')}"
+        size = ", ".join(terms)
+        if self.quadratic or self.cubic:  # sensitivity alone is the same at every temperature
+            size += f" around {self.quantity('reference')}"
         if self.sensor_lag:
             size += f", measured by a sensor that lags by {self.quantity('sensor_lag', errors)}"
         return f"The bias follows the temperature {self.on_axes()}, by {size}."

@@ -243,7 +243,12 @@ def test_overlapping_windows_use_means_only():
             {"name": "temperature_bias", "sensitivity": 0.1, "cubic": 1e-6},
             r"by 0.1 deg/h/degC, 1e-06 deg/h/degC\^3 around 25 degC",
         ),
-        ({"name": "temperature_bias", "sensitivity": 0.0}, r"by 0 deg/h/degC around 25 degC"),
+        (
+            {"name": "temperature_bias", "sensitivity": 0.1, "quadratic": 1e-4, "reference": 80.0},
+            r"by 0.1 deg/h/degC, 0.0001 deg/h/degC\^2 around 80 degC",
+        ),
+        ({"name": "temperature_bias", "sensitivity": 0.1}, r"by 0\.1 deg/h/degC\.$"),
+        ({"name": "temperature_bias", "sensitivity": 0.0}, r"by 0 deg/h/degC\.$"),
         (
             {"name": "temperature_noise", "linear": 0.0, "quadratic": 1e-5},
             r"relative to its value at 25 degC, N\^2 changes by 1e-05 1/degC\^2\.",
