@@ -91,7 +91,7 @@ class SurveyModel:
         """Return all sentences on the terms."""
         return (*self.origin, self.conditions, *self.notes)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         """Return the terms as an aligned table, followed by the remarks."""
         rows = [("term", "1 sigma", "5 % to 95 %", "unit", "mode", "propagation", "from")]
         for term in self.terms:

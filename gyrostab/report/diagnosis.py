@@ -172,6 +172,11 @@ def write_diagnosis(
     >>> found = gyrostab.diagnose(gyrostab.open_log("run7.nc"))  # doctest: +SKIP
     >>> gyrostab.write_diagnosis(found, "run7-diagnosis")  # doctest: +SKIP
     """
+    if not isinstance(diagnosis, Diagnosis):
+        raise SchemaError(
+            f"this is a {type(diagnosis).__name__}, not a diagnosis; gyrostab.diagnose and "
+            "gyrostab.open_diagnosis return one"
+        )
     check_diagnosis(diagnosis.content)
     directory = Path(directory)
     files = [Path(name).name for name in diagnosis.content["recording"]["files"]]
@@ -231,6 +236,11 @@ def open_diagnosis(directory: str | os.PathLike[str]) -> Diagnosis:
     gyrostab.errors.FormatError: nowhere: there is no such folder; gyrostab diagnose RECORDING ...
     """
     directory = Path(directory)
+    if directory.is_file():
+        raise FormatError(
+            f"{directory}: is a file; give the folder of the diagnosis, for instance "
+            f"{directory.parent}"
+        )
     if not directory.is_dir():
         raise FormatError(
             f"{directory}: there is no such folder; gyrostab diagnose RECORDING -o DIR makes one"

@@ -126,7 +126,7 @@ def test_limit_stays_marked_as_limit():
     drift = {term.code: term for term in model.terms}["GXY-GD"]
     assert drift.value == pytest.approx(math.sqrt(33.73023 - 9.0 + 36.0))
     assert (drift.status, drift.low < drift.value) == ("upper_limit_only", True)
-    assert f"< {drift.value:.3g}" in str(model)
+    assert f"< {drift.value:.3g}" in str(model) == repr(model)
     assert {term.status for term in model.terms if term.code.endswith(("RN", "RW"))} == {"observed"}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -48,8 +48,8 @@ class Diagnosis:
     """
 
     content: Mapping[str, Any]
-    surfaces: xr.Dataset = field(repr=False)
-    model: Mapping[str, Any] = field(repr=False)
+    surfaces: xr.Dataset
+    model: Mapping[str, Any]
 
     @property
     def verdict(self) -> str:
@@ -75,7 +75,7 @@ class Diagnosis:
         """Return the contents as JSON."""
         return json.dumps(self.content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         """Return the verdict with a sentence for each effect and each unexplained mismatch."""
         lines = [f"{self.verdict}: {summary(self.content)}"]
         for effect, *others in join_axes(group_families(self.effects)):

@@ -236,6 +236,11 @@ def test_folder_of_four_files_round_trips(tmp_path: Path):
     assert [path.name for path in files] == list(FILES)
     assert sorted(path.name for path in (tmp_path / "found").iterdir()) == sorted(FILES)
     assert [path.name for path in tmp_path.iterdir()] == ["found"]
+    with pytest.raises(FormatError, match=r"is a file; give the folder of the diagnosis, .*found$"):
+        open_diagnosis(tmp_path / "found" / "diagnosis.json")
+    with pytest.raises(SchemaError, match="this is a dict, not a diagnosis; gyrostab"):
+        write_diagnosis(made.content, tmp_path / "other")
+    assert repr(made) == str(made)
     opened = open_diagnosis(tmp_path / "found")
     assert opened.content == json.loads(made.to_json())
     assert opened.model == made.model
