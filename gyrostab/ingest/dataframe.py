@@ -29,6 +29,10 @@ _OPTION = re.compile(
 _FILE_ADVICE = (
     ("; gyrostab scan DataFrame inspects each column", ""),
     (
+        "If it holds channels of another log, give it as --channel DataFrame",
+        "Say which column is one: map={'NAME': 'gyro_x'}",
+    ),
+    (
         "the separator, the columns that --map names and the unit of time",
         "the columns and the index",
     ),

@@ -818,6 +818,8 @@ def make_table(**columns) -> pd.DataFrame:
      r"with a factor units=\{'gyro': '0.1 arcsec/s'\}"),
     (make_table(gyro_x=None), {"units": "deg"}, "give kind='angle' if it is the cumulative angle"),
     (make_table(gyro_x=np.nan), {"units": "deg/h"}, "unreadable.*check the columns and the index"),
+    (make_table(gyro_x=np.arange(200) * 1j), {"units": "deg/h"}, "unreadable.*check the columns"),
+    (make_table(temperature=None), {"units": "deg/h"}, r"one: map=\{'NAME': 'gyro_x'\}$"),
     (make_table(gyro_x=None, angle_x=None), {"units": {"gyro": "deg/h", "angle": "deg"}},
      r"drop the others, for instance map=\{'angle_x': '-'\}"),
     (make_table(gyro_x=None)[:0], {"units": "deg/h"}, "the DataFrame has 0 rows"),

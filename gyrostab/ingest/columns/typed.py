@@ -46,6 +46,8 @@ def _to_floats(values: Any) -> tuple[Floats, int]:
             fresh = array.flags.owndata and array.flags.writeable
             return array.astype(np.float64, copy=not fresh), 0
     out = np.full(array.shape, np.nan)
+    if array.dtype.kind == "c":
+        return out, array.size
     words = 0
     for index, value in enumerate(array.ravel()):
         try:
