@@ -304,7 +304,7 @@ def _fit_windows(
     if surface.sizes["tau"] == chosen.size > allowed.bit_count():
         edf = np.where(below, surface["edf"].data, fitted[..., 4 * len(TERMS) + 2 :])
         out["edf"] = (("axis", "time", "tau"), edf, surface["edf"].attrs)
-    return surface.assign(out)
+    return surface.drop_dims("term", errors="ignore").assign(out)  # of an earlier fit
 
 
 def _fit_cells(

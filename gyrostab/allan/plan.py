@@ -126,8 +126,10 @@ def select_axes(log: Data, axis: str | Sequence[str]) -> Data:
     axes = list(dict.fromkeys(str(np.asarray(label)) for label in labels))
     available = [str(name) for name in log["axis"].values]
     unknown = [name for name in axes if name not in available]
-    if unknown or not axes:
-        quoted = ", ".join(map(repr, unknown)) or "''"
+    if not axes:
+        raise OptionError(f"axis={axis!r} names no axis; the log has {', '.join(available)}")
+    if unknown:
+        quoted = ", ".join(map(repr, unknown))
         raise OptionError(f"axis {quoted} is not in the log; it has {', '.join(available)}")
     return log.sel(axis=axes)
 

@@ -281,14 +281,12 @@ def _check_channel(channel: xr.DataArray, product: xr.Dataset) -> tuple[Floats, 
     order = np.argsort(stamps, kind="stable")
     stamps, values = stamps[order], channel.values[good][order].astype(np.float64)
     bounds = to_nanoseconds(product["time_bounds"].values)
-    if not stamps.size or stamps[-1] < bounds[0, 0] or stamps[0] >= bounds[-1, 1]:
-        extent = (
-            "holds no value"
-            if not stamps.size
-            else f"spans {_stamp_text(stamps[0])} to {_stamp_text(stamps[-1])}"
-        )
+    if not stamps.size:
+        raise SchemaError(f"channel {channel.name!r} holds no value; give one with values")
+    if stamps[-1] < bounds[0, 0] or stamps[0] >= bounds[-1, 1]:
+        extent = f"{_stamp_text(stamps[0])} to {_stamp_text(stamps[-1])}"
         raise TimeError(
-            f"channel {channel.name!r} {extent}, the product {_stamp_text(bounds[0, 0])} to "
+            f"channel {channel.name!r} spans {extent}, the product {_stamp_text(bounds[0, 0])} to "
             f"{_stamp_text(bounds[-1, 1])}: they do not overlap; if the file is in local time, "
             "give its offset from UTC with unit (--unit time=UTC-06:00), and if its time is a "
             "number, the zero of it with epoch (--epoch)"

@@ -10,6 +10,7 @@ import xarray as xr
 from gyrostab.arrays import Floats, Ints
 from gyrostab.correlate.drivers import slope_units
 from gyrostab.errors import SchemaError
+from gyrostab.schema import with_axis
 from gyrostab.wording import format_rounded
 
 #: Flag values of ``coupling_verdict``.
@@ -203,7 +204,7 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
     >>> row["variable"], row["driver"], row["unit"], row["verdict"]
     ('window_mean', 'temperature', 'deg/h/K', 'none seen')
     """
-    require_correlation(result)
+    result = require_correlation(result)
     rows = []
     for a, axis in enumerate(result["axis"].values):
         for v, name in enumerate(result["variable"].values):
@@ -242,12 +243,26 @@ def correlation_rows(result: xr.Dataset) -> list[dict[str, str]]:
     return rows
 
 
-def require_correlation(result: Any) -> None:
-    """Raise `SchemaError` unless this is a result of `gyrostab.correlate`."""
+def require_correlation(result: Any) -> xr.Dataset:
+    """Return a result of `gyrostab.correlate` with its axes, even after ``.sel(axis="x")``.
+
+    Raises
+    ------
+    SchemaError
+        If it is something else, or has lost another of its dimensions.
+    """
     if not isinstance(result, xr.Dataset) or "coupling_verdict" not in result:
         raise SchemaError(
             "this holds no correlation; call gyrostab.correlate (or 'gyrostab correlate') first"
         )
+    correlation: xr.Dataset = with_axis(result)
+    for dim in ("axis", "variable", "driver"):
+        if dim not in correlation.dims:
+            raise SchemaError(
+                f"the correlation has no dimension {dim!r}; keep it, even to select one label: "
+                f".isel({dim}=[0])"
+            )
+    return correlation
 
 
 def _format_partial(cell: xr.Dataset, name: str) -> str:

@@ -156,6 +156,8 @@ def _select_window(part: xr.Dataset, when: Any) -> int:
         )
         return int(best[np.argmin(np.abs(best - time.size // 2))])
     try:
+        if isinstance(when, int | float | np.number):  # seconds or nanoseconds
+            raise ValueError("no time")
         stamp, _ = span_of(when)
     except (TypeError, ValueError) as error:
         raise OptionError(

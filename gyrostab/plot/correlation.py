@@ -87,7 +87,7 @@ def plot_correlation(
     >>> plot_correlation(correlate(product, variables="window_mean")).axes[0].get_ylabel()
     'window mean [deg/h]'
     """
-    require_correlation(result)
+    result = require_correlation(result)
     names = axis_names(result, axis)
     driver = str(result["driver"].values[0]) if driver is None else driver
     if driver not in result["driver"].values:

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.arrays import Array
-from gyrostab.errors import OptionError, SchemaError
+from gyrostab.errors import OptionError
 from gyrostab.schema import check_coefficients, require_dataset
 from gyrostab.time.durations import format_duration
 from gyrostab.units import INNER
@@ -149,9 +149,10 @@ def draws_figure(draw: Callable[P, Figure]) -> Callable[P, Figure]:
         import matplotlib as mpl
 
         width = cast(float, options.get("width", PAGE_MM))
-        if not MIN_WIDTH_MM <= width <= MAX_WIDTH_MM:
+        is_number = isinstance(width, int | float | np.number)
+        if not (is_number and MIN_WIDTH_MM <= width <= MAX_WIDTH_MM):
             raise OptionError(
-                f"a figure cannot be {width:g} mm wide; give --width (width=) from "
+                f"a figure cannot be {width} mm wide; give --width (width=) from "
                 f"{MIN_WIDTH_MM:g} to {MAX_WIDTH_MM:g}, for instance 180 for a page"
             )
         points = _FONT_POINTS if width >= NARROW_MM else _FONT_POINTS - 1.0
@@ -297,11 +298,6 @@ def shade_spans(
 
 
 def require_coefficients(product: xr.Dataset) -> None:
-    """Raise `SchemaError` if the dataset has no coefficients."""
+    """Raise `SchemaError` if the dataset has no coefficients, whatever the order of its axes."""
     require_dataset(product, "product")
-    if "observable" not in product.variables:
-        raise SchemaError(
-            "this surface holds no coefficients yet; call gyrostab.fit_noise (or 'gyrostab fit') "
-            "first"
-        )
     check_coefficients(product.transpose("axis", "time", ..., missing_dims="ignore"))

@@ -196,7 +196,7 @@ def _require_variables(dataset: xr.Dataset, kind: str, dims: Mapping[str, tuple[
     for name, expected in dims.items():
         if name not in dataset.variables:
             raise SchemaError(
-                f"this is not a {kind}: it has no variable {name!r}; "
+                f"this is not a {kind}, which {_MAKERS[kind]} makes: it has no variable {name!r}; "
                 f"it has {sorted(map(str, dataset.variables))}"
             )
         if (has := dataset.variables[name].dims) != expected:
@@ -218,7 +218,8 @@ def _advise_dimensions(has: tuple[Hashable, ...], expected: tuple[str, ...]) -> 
     if not lost:
         return (
             f"if datasets were concatenated along {extra[0]!r}, give xarray.concat "
-            "data_vars='minimal'"
+            "data_vars='minimal'; instead of .where(...), which repeats every variable along "
+            f"{extra[0]!r}, select with .isel({extra[0]}=...)"
         )
     return f"rename {extra[0]!r} to {lost[0]!r}"
 
@@ -333,12 +334,15 @@ def describe_times(log: xr.Dataset, product: xr.Dataset) -> str:
     )
 
 
-def check_surface(surface: xr.Dataset) -> None:
-    """Raise `SchemaError` unless `surface` is what `gyrostab.davar` returns, or a part of it."""
+def check_surface(surface: xr.Dataset, kind: str = "DAVAR surface") -> None:
+    """Raise `SchemaError` unless `surface` is what `gyrostab.davar` returns, or a part of it.
+
+    Messages call it `kind`.
+    """
     cube = ("axis", "time", "tau")
     _require_variables(
         surface,
-        "DAVAR surface",
+        kind,
         {name: cube for name in ("avar", "count", "coverage", "edf", "estimator")}
         | {name: cube[:2] for name in ("window_mean", "window_coverage")},
     )
@@ -409,6 +413,11 @@ def _check_tau(surface: xr.Dataset) -> None:
 
 def check_coefficients(product: xr.Dataset) -> None:
     """Raise `SchemaError` unless `product` holds the coefficients of every axis and window."""
+    require_dataset(product, "product")
+    if "observable" not in product.variables:
+        raise SchemaError(
+            "this holds no coefficients yet; call gyrostab.fit_noise (or 'gyrostab fit') first"
+        )
     names = [f"{term}{end}" for term in TERMS for end in ("", "_stderr", "_upper")]
     dims = {"axis": ("axis",), "time": ("time",), **dict.fromkeys(names, ("axis", "time"))}
     _require_variables(product, "product", {**dims, "observable": ("axis", "time", "term")})
@@ -423,7 +432,7 @@ def check_coefficients(product: xr.Dataset) -> None:
 
 def check_product(product: xr.Dataset) -> None:
     """Raise `SchemaError` unless `product` is what `gyrostab.fit_noise` returns."""
-    check_surface(product)
+    check_surface(product, "product")
     check_coefficients(product)
     names = ("fit_tau_min", "filter_time_constant", "filter_white_error")
     _require_variables(product, "product", {name: ("axis",) for name in names if name in product})

@@ -123,8 +123,8 @@ def simulate(
     """
     made = model if isinstance(model, Model) else read_model(model)
     like = None if like is None else as_log(like)
-    if chunk is not None and chunk < 1:
-        raise OptionError(f"chunk={chunk!r}: give at least 1 sample")
+    if chunk is not None and not (isinstance(chunk, int | np.integer) and chunk >= 1):
+        raise OptionError(f"chunk={chunk!r}: give a whole number of samples, at least 1")
     frame = make_frame(made, duration=duration, rate=rate, start=start, seed=seed, like=like)
     check_axes(made, frame)
     with naming_of(made.source):

@@ -256,13 +256,18 @@ def make_noise(
     coefficients = {"Q": Q, "N": N, "B": B, "K": K, "R": R}
     for name, value in {"rate": rate, "size": size, "chunk": chunk, **coefficients}.items():
         minimum = 0.0 if name in TERMS else 1e-9
-        if not (math.isfinite(value) and (value >= minimum or name == "R")):
+        is_number = isinstance(value, int | float | np.number) and math.isfinite(value)
+        if not (is_number and (value >= minimum or name == "R")):
             raise OptionError(
                 f"{name}={value!r}: give a number {'from 0 up' if name in TERMS else 'above 0'}"
             )
     for name, value in {"size": size, "chunk": chunk}.items():
         if not isinstance(value, int | np.integer):
             raise OptionError(f"{name}={value!r}: give a whole number of samples")
+    if np.size(flicker_band) != 2:
+        raise OptionError(
+            f"flicker_band={flicker_band!r}: give the lowest and the highest frequency in Hz"
+        )
     if gauss_markov and not (
         len(gauss_markov) == 2
         and all(math.isfinite(value) for value in gauss_markov)

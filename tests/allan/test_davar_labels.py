@@ -107,6 +107,7 @@ def test_channel_without_units_has_none_in_the_surface():
         ({"window": "10s", "taus": ["soon"]}, "40 .how many., octave, all or 0.1s.*for taus"),
         ({"window": "10s", "axis": "q"}, "axis 'q' is not in the log; it has x"),
         ({"window": "10s", "axis": 0}, "axis '0' is not in the log; it has x"),
+        ({"window": "10s", "axis": []}, r"axis=\[\] names no axis; the log has x"),
         ({"window": True}, "window True is not a duration"),
         ({"window": "10s", "min_strict": "0.3"}, "min_strict='0.3': give a share from 0 to 1"),
         ({"window": "10s", "min_strict": -0.1}, "min_strict=-0.1"),

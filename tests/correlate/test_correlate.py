@@ -684,6 +684,9 @@ def test_errors_say_what_to_do():
     series = product["temperature"].to_series()
     with pytest.raises(OptionError, match=r"type Series is neither .*DataArray; .*\.to_xarray\(\)"):
         gyrostab.correlate(product, channel=series)
+    empty = (product["temperature"] * np.nan).assign_attrs(units="degC")
+    with pytest.raises(SchemaError, match="channel 'temperature' holds no value; give one with"):
+        gyrostab.correlate(product, channel=empty)
     alone = product.drop_vars(["temperature", "temperature_rate"])
     with pytest.raises(OptionError, match="the product has no channels; give a file"):
         gyrostab.correlate(alone)

@@ -354,6 +354,7 @@ def test_adev_without_a_time_avoids_the_gap(product):
         ("noon", "not understood"),
         ("NaT", "not understood"),
         ([1, 2], "not understood"),
+        (5, "time 5 is not understood"),  # seconds or nanoseconds
     ],
 )
 def test_adev_refuses_an_impossible_time(product, when, words):
@@ -435,7 +436,7 @@ def test_product_of_a_constant_signal_is_drawn_without_warnings(share, tmp_path)
         write_report(product, tmp_path / "report.html")
 
 
-@pytest.mark.parametrize("width", [0.0, -85.0, 1e9, float("nan")])
+@pytest.mark.parametrize("width", [0.0, -85.0, 1e9, float("nan"), "85"])
 def test_impossible_widths_are_refused(product, width):
     with pytest.raises(OptionError, match=r"cannot be .* mm wide; give --width"):
         plot_coefficients(product, width=width)

@@ -43,6 +43,15 @@ def product() -> xr.Dataset:
             "concatenated along 'time'.*data_vars='minimal'",
         ),
         (
+            lambda p: p.assign(fit_tau_min=("axis", [1.0, 1.0, 1.0])).where(p.time > p.time[5]),
+            r"instead of \.where\(\.\.\.\).* along 'time', select with \.isel\(time=",
+        ),
+        (
+            lambda p: p.drop_dims("term"),
+            r"holds no coefficients yet; call gyrostab\.fit_noise .* first",
+        ),
+        (lambda p: p.drop_vars("edf"), "not a product, which gyrostab.fit_noise makes.* 'edf'"),
+        (
             lambda p: p.assign_attrs(sampling_rate_hz="20 Hz"),
             "sampling_rate_hz .* is '20 Hz', not a number",
         ),
@@ -118,6 +127,24 @@ def test_a_selected_axis_is_fitted_correlated_and_stored(
         xr.testing.assert_equal(gyrostab.open_product(path).load(), listed)
 
 
+def test_a_correlation_of_a_selected_axis_is_tabulated_and_drawn(product: xr.Dataset) -> None:
+    correlation = gyrostab.correlate(product, variables="window_mean", max_lag=0)
+    single, listed = correlation.sel(axis="y"), correlation.sel(axis=["y"])
+    rows = gyrostab.correlation_rows(single)
+    assert rows == gyrostab.correlation_rows(listed) == gyrostab.correlation_rows(correlation)[2:4]
+    drawn, expected = (gyrostab.plot_correlation(part).axes for part in (single, listed))
+    assert [panel.dataLim.bounds for panel in drawn] == [panel.dataLim.bounds for panel in expected]
+    for function in (gyrostab.correlation_rows, gyrostab.plot_correlation):
+        with pytest.raises(SchemaError, match=r"no dimension 'driver'; .*\.isel\(driver=\[0\]\)"):
+            function(correlation.sel(driver="temperature"))
+
+
+def test_a_product_with_some_of_its_terms_is_fitted_again() -> None:
+    expected = gyrostab.fit_noise(gyrostab.davar(synthetic.log(), window="5s"))
+    for part in (expected.sel(term=["N", "B"]), expected.sel(term="N")):
+        xr.testing.assert_equal(gyrostab.fit_noise(part), expected)
+
+
 def test_a_single_window_is_stored_and_refused_as_a_product(
     product: xr.Dataset, tmp_path: Path
 ) -> None:
@@ -149,7 +176,7 @@ def test_an_allan_deviation_of_several_axes_needs_one(product: xr.Dataset) -> No
         (gyrostab.davar, "gyrostab.open_log, or a file of another program with"),
         (gyrostab.regularise, "gyrostab.read_log"),
         (gyrostab.fit_noise, "gyrostab.open_surface"),
-        (gyrostab.correlate, "gyrostab.open_surface"),
+        (gyrostab.correlate, "gyrostab.open_product"),
         (gyrostab.plot_coefficients, "gyrostab.open_product"),
     ],
 )

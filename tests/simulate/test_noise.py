@@ -207,6 +207,12 @@ def test_level_may_change_from_sample_to_sample():
         ({"N": -1.0}, "N=-1.0: give a number from 0 up"),
         ({"rate": 0.0}, "rate=0.0: give a number above 0"),
         ({"K": np.nan}, "K=nan"),
+        ({"N": "0.01"}, "N='0.01': give a number from 0 up"),
+        ({"rate": None}, "rate=None: give a number above 0"),
+        (
+            {"B": 1.0, "flicker_band": (1.0,)},
+            r"flicker_band=\(1.0,\): give the lowest and the high",
+        ),
         ({"size": 1000.0}, "size=1000.0: give a whole number of samples"),
         ({"gauss_markov": (1.0, 0.0)}, "gauss_markov=.*correlation time in s, above 0"),
         ({"gauss_markov": (1.0, -5.0)}, "gauss_markov=.*correlation time in s, above 0"),

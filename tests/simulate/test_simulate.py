@@ -369,6 +369,8 @@ def test_writing_in_pieces_makes_each_block_once(tmp_path, monkeypatch):
             SchemaError,
             "has gap_start, gap_end of a table of gaps, which needs",
         ),
+        ({"chunk": 1.5}, OptionError, "chunk=1.5: give a whole number of samples"),
+        ({"chunk": "1"}, OptionError, "chunk='1': give a whole number of samples"),
     ],
 )
 def test_arguments_of_a_wrong_kind_are_refused(options, error, words):
