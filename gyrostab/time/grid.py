@@ -211,13 +211,27 @@ class TimeGridIndex(CoordinateTransformIndex):
         """Sampling rate [Hz]."""
         return self.transform.rate / self.transform.samples.step
 
-    def isel(self, indexers: Mapping[Any, Any]) -> TimeGridIndex | None:
-        """Keep the index for slices forward; other selections get an ordinary coordinate."""
-        part = indexers[self.transform.dims[0]]
-        is_forward = isinstance(part, slice) and (part.step is None or part.step > 0)
-        if not is_forward:
+    def isel(self, indexers: Mapping[Any, Any]) -> Any:
+        """Keep the index for slices forward; other selections have an ordinary one, in memory."""
+        (dim,), size = self.transform.dims, self.transform.size
+        part = indexers[dim]
+        if isinstance(part, slice):
+            if part.step is None or part.step > 0:
+                return type(self)(self.transform.select(self.transform.samples[part]))
+            part = np.arange(*part.indices(size))
+        if isinstance(part, xr.Variable):
+            if part.dims != (dim,):
+                return None
+            part = part.data
+        places = np.asarray(part)
+        if places.ndim != 1:
             return None
-        return type(self)(self.transform.select(self.transform.samples[part]))
+        places = np.flatnonzero(places) if places.dtype.kind == "b" else places.astype(np.int64)
+        if ((places < -size) | (places >= size)).any():
+            raise IndexError(f"{dim!r} has {size} samples, and one outside of them is selected")
+        places = np.where(places < 0, places + size, places)
+        stamps = self.transform.stamps_at(places).view("datetime64[ns]")
+        return xr.indexes.PandasIndex(pd.DatetimeIndex(stamps), dim)
 
     @classmethod
     def concat(cls, indexes: Sequence[Any], dim: Any, positions: Any = None) -> Any:

@@ -112,6 +112,38 @@ class TestIndex:
         part = backwards.x.sel(time=slice(stamps[20], stamps[10]))
         np.testing.assert_array_equal(part, np.arange(20.0, 9.0, -1))
 
+    @pytest.mark.parametrize(
+        "part",
+        [
+            [5, 9, 2],
+            [-1, 0],
+            [],
+            np.arange(3000) % 7 == 3,
+            xr.Variable("time", [4, 4]),
+            slice(None, None, -1),
+            slice(40, 10, -7),
+        ],
+    )
+    def test_other_samples_keep_their_times(self, log, part):
+        ordinary = log.assign_coords(time=log.time.values)
+        chosen, expected = (data.x.isel(time=part) for data in (log, ordinary))
+        assert chosen.xindexes["time"].equals(expected.xindexes["time"])
+        pd.testing.assert_series_equal(chosen.to_series(), expected.to_series())
+
+        with pytest.raises(IndexError):
+            log.x.isel(time=[0, 3000])
+
+    def test_other_samples_are_aligned_by_their_times(self, log):
+        common = log.x.isel(time=[5, 9]) - log.x.isel(time=[9, 5])
+        np.testing.assert_array_equal(common, [0.0, 0.0])
+        assert (log.x.isel(time=[5, 9]) - log.x.isel(time=[9, 12])).sizes == {"time": 1}
+
+    def test_a_selection_without_the_dimension_of_time_has_no_index(self, log):
+        assert "time" not in log.x.isel(time=5).xindexes
+        places = xr.Variable("event", [5, 9])
+        assert "time" not in log.x.isel(time=places).xindexes
+        np.testing.assert_array_equal(log.x.isel(time=places).time, log.time.values[[5, 9]])
+
     def test_labels_that_are_not_there_are_refused(self, log):
         off = log.time.values[5] + np.timedelta64(1, "ns")
         with pytest.raises(KeyError, match="no sample exactly"):
