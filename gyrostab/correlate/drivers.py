@@ -88,9 +88,13 @@ def _align_channel(
     if isinstance(channel, str):
         if channel not in product.data_vars or product[channel].dims != ("time",):
             missing = f" {channel!r}" if _channel_names(product) else "s"
-            raise OptionError(
-                f"the product has no channel{missing}; {suggest_channels(product, channel)}"
+            lack = (
+                f"{channel!r} of the product has dimensions {product[channel].dims}, and a channel "
+                "lies on time only"
+                if channel in product.data_vars
+                else f"the product has no channel{missing}"
             )
+            raise OptionError(f"{lack}; {suggest_channels(product, channel)}")
         name = channel
         factor, offset, units = _convert_units(product[channel], f"product[{channel!r}]")
         mean, rate = _align_product_channel(product, channel, lags, step)

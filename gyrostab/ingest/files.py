@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import re
 from collections.abc import Iterable, Sequence
 from functools import cache
@@ -88,7 +89,11 @@ def expand(paths: str | Path | Iterable[str | Path]) -> list[Path]:
     differ only in numbers are in the order of these: run_9 comes before run_10.
     """
     files: dict[Path, None] = {}
-    for item in [paths] if isinstance(paths, str | Path) else paths:
+    is_single = isinstance(paths, str | bytes) or hasattr(paths, "read")
+    items: Any = [paths] if is_single or not isinstance(paths, Iterable) else paths
+    for item in items:
+        if not isinstance(item, str | os.PathLike):
+            raise OptionError(f"{item!r} is not the name of a file; give a text or a pathlib.Path")
         text = str(item)
         url = find_url(item)
         if not glob.has_magic(text) or Path(text).exists():

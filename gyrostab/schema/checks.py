@@ -278,12 +278,7 @@ def check_log(log: xr.Dataset, *, rate: bool = True) -> None:
         )
     if log.sizes["axis"] == 0 or log.sizes["time"] == 0:
         raise SchemaError("the log is empty: it has no axis or no sample")
-    names = name_axes(log)
-    if len(set(names)) < len(names):
-        raise SchemaError(
-            f"the axes {', '.join(map(repr, names))} have names in common; rename them with "
-            "log.assign_coords(axis=[...])"
-        )
+    _refuse_equal_axes(name_axes(log), "log")
     declared = log.attrs.get("sampling_rate_hz")
     if rate and (declared is None or not np.isfinite(declared) or declared <= 0):
         raise SchemaError(
@@ -356,6 +351,14 @@ def check_surface(surface: xr.Dataset, kind: str = "DAVAR surface") -> None:
     _check_tau(surface)
 
 
+def _refuse_equal_axes(names: list[str], kind: str) -> None:
+    if len(set(names)) < len(names):
+        raise SchemaError(
+            f"the axes {', '.join(map(repr, names))} have names in common; rename them with "
+            f"{kind}.assign_coords(axis=[...])"
+        )
+
+
 def _check_labels(dataset: xr.Dataset, kind: str) -> None:
     """Windows have dates and times, axes have names, and there are some of them."""
     for name, counted in (("time", "window"), ("axis", "axis"), ("tau", "averaging time")):
@@ -374,6 +377,7 @@ def _check_labels(dataset: xr.Dataset, kind: str) -> None:
                 f"{name!r} of the {kind} holds {shown}{', ...' if labels.size > 3 else ''}, not "
                 f"{holds}; give them with .assign_coords({name}=...), {example}"
             )
+    _refuse_equal_axes(name_axes(dataset), kind)
 
 
 def _check_tau(surface: xr.Dataset) -> None:

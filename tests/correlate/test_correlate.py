@@ -687,6 +687,11 @@ def test_errors_say_what_to_do():
     empty = (product["temperature"] * np.nan).assign_attrs(units="degC")
     with pytest.raises(SchemaError, match="channel 'temperature' holds no value; give one with"):
         gyrostab.correlate(product, channel=empty)
+    repeated = product.assign(temperature=product["temperature"] + xr.zeros_like(product["N"]))
+    with pytest.raises(
+        OptionError, match=r"'temperature' of the product has dimensions \('time', "
+    ):
+        gyrostab.correlate(repeated)
     alone = product.drop_vars(["temperature", "temperature_rate"])
     with pytest.raises(OptionError, match="the product has no channels; give a file"):
         gyrostab.correlate(alone)

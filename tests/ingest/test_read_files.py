@@ -16,6 +16,7 @@ import gyrostab.ingest.reading as reading
 from gyrostab.errors import FormatError, OptionError, SchemaError, TimeError, UnitError
 from gyrostab.ingest import FileSummary, ReadOptions, read_log, readers, scan_file
 from gyrostab.ingest.grid.regularise import regularise
+from gyrostab.ingest.scan import scan
 from gyrostab.schema import check_log, check_raw
 from gyrostab.store.read import MIN_LAZY_VALUES
 from gyrostab.time.grid import TimeGridIndex, time_coordinate
@@ -590,3 +591,12 @@ def test_heavy_libraries_load_when_they_are_used() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert result.stdout.strip() == "[]"
+
+
+def test_what_is_not_the_name_of_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("time [s],gyro_x [deg/h]\n0,1\n1,2\n")
+    with (tmp_path / "log.csv").open() as opened:
+        for given in (opened, 5, None, b"log.csv", [tmp_path / "log.csv", 5]):
+            for function in (read_log, scan):
+                with pytest.raises(OptionError, match="is not the name of a file; give a text or"):
+                    function(given)

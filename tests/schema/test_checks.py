@@ -50,6 +50,10 @@ def product() -> xr.Dataset:
             lambda p: p.drop_dims("term"),
             r"holds no coefficients yet; call gyrostab\.fit_noise .* first",
         ),
+        (
+            lambda p: xr.concat([p, p], "axis", data_vars="minimal"),
+            r"'x', 'y', 'z', 'x', 'y', 'z' have names in common; .*\.assign_coords\(axis=",
+        ),
         (lambda p: p.drop_vars("edf"), "not a product, which gyrostab.fit_noise makes.* 'edf'"),
         (
             lambda p: p.assign_attrs(sampling_rate_hz="20 Hz"),
