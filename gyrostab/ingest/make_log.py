@@ -49,7 +49,7 @@ def make_log(
         Kind of the values: rates or cumulative angles.
     channels : mapping, optional
         Name -> (values on the same time, unit), for instance ``{"temperature": (t, "degC")}``;
-        numpy or dask.
+        numpy or dask. A channel of another name keeps a unit that is not known, such as m/s.
 
     Returns
     -------
@@ -139,12 +139,17 @@ def _channel_variable(name: str, channel: Any, size: int) -> xr.Variable:
             f"channel {name!r} has values of shape {values.shape}, and the log {size} samples; "
             "give one value per sample, NaN where it is missing"
         )
-    unit = parse_unit(text, quantity)
     is_named = KNOWN_CHANNEL_PATTERN.match(name) and quantity != "number"  # a ramp has any unit
-    if is_named and quantity is not None and unit.quantity != quantity:
+    try:
+        unit = parse_unit(text, quantity)
+    except UnitError:
+        unit = None
+    if is_named and quantity is not None and (unit is None or unit.quantity != quantity):
         raise UnitError(
-            f"channel {name!r}: {text!r} is a unit of {unit.quantity}, not of {quantity}; known "
-            f"are {known_units(quantity)}"
+            f"channel {name!r}: {text!r} is not a unit of {quantity}; known are "
+            f"{known_units(quantity)}"
         )
+    if unit is None:
+        return xr.Variable("time", values * 1.0, {"units": text})
     converted = values * unit.factor + unit.offset
     return xr.Variable("time", converted, {"units": INNER[unit.quantity]})

@@ -59,7 +59,16 @@ def test_infinite_values_are_missing(to_array):
         ({"rate": None}, OptionError, "rate None: give"),
         ({"channels": {"rate": (VALUES, "deg/h")}}, OptionError, "'rate': variables of gyrostab"),
         ({"channels": {"time": (VALUES, "1")}}, OptionError, "'time': variables of gyrostab"),
-        ({"channels": {"temperature": (VALUES, "V")}}, UnitError, "unit of voltage, not of temp"),
+        (
+            {"channels": {"temperature": (VALUES, "V")}},
+            UnitError,
+            "'V' is not a unit of temperature",
+        ),
+        (
+            {"channels": {"pressure": (VALUES, "m/s")}},
+            UnitError,
+            "channel 'pressure': 'm/s' is not a unit of pressure; known are Pa",
+        ),
         ({"channels": {"accel_x": (VALUES[1:], "g")}}, OptionError, r"shape \(49,\).* 50 samples"),
         (
             {"channels": {"vibration": VALUES}},
@@ -130,8 +139,9 @@ def test_values_need_a_unit(unit):
         make_log(VALUES, rate=10.0, unit=unit)
 
 
-def test_channels_have_the_units_of_channels_of_files():
+def test_channels_have_the_units_of_channels_of_files(tmp_path):
     given = {"rotation_rate": "rpm", "toolface": "rad", "temperature_case": "V", "ramp": "V"}
+    given |= {"flow": "gal/min", "temperature_of_mud": "furlong"}
     channels = {name: (np.ones(50), unit) for name, unit in given.items()}
     log = make_log(VALUES, rate=10.0, unit="deg/h", channels=channels)
     assert {name: (float(log[name][0]), log[name].units) for name in given} == {
@@ -139,7 +149,11 @@ def test_channels_have_the_units_of_channels_of_files():
         "toolface": (pytest.approx(57.29578), "degree"),
         "temperature_case": (1.0, "V"),
         "ramp": (1.0, "V"),
+        "flow": (1.0, "gal/min"),
+        "temperature_of_mud": (1.0, "furlong"),
     }
+    path = gyrostab.to_netcdf(log, tmp_path / "log.nc")
+    assert gyrostab.open_log(path).flow.units == "gal/min"
 
 
 @pytest.mark.parametrize("missing", [[], [11]], ids=["uniform", "gap"])
