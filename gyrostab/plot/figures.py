@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.correlate import correlate
+from gyrostab.errors import OptionError
 from gyrostab.plot.adev import plot_adev
 from gyrostab.plot.coefficients import plot_coefficients
 from gyrostab.plot.correlation import plot_correlation
@@ -89,8 +90,8 @@ def save_figures(
 
     Raises
     ------
-    SchemaError
-        If `product` is not a product.
+    SchemaError, OptionError
+        If `product` is not a product, or `width` or `dpi` are impossible.
     OutputError
         If a figure exists and `overwrite` is False, or the folder cannot be written to; then no
         figure is written.
@@ -106,6 +107,8 @@ def save_figures(
     ...     [path.name for path in save_figures(product, folder, dpi=30)]
     ['coefficients.png', 'davar.png', 'davar_change.png', 'adev_x.png', 'davar_3d_x.png']
     """
+    if not (isinstance(dpi, int | float | np.number) and dpi > 0):
+        raise OptionError(f"dpi={dpi!r}: give pixels per inch, above 0, for instance 300")
     folder = Path(folder)
     figures: dict[str, Callable[[], Figure]] = {}
     for name, draw in product_figures(product, width=width).items():

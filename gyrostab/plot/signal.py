@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -16,6 +16,7 @@ from gyrostab.plot.style import (
     PAGE_MM,
     axis_names,
     axis_style,
+    check_columns,
     draws_figure,
     find_true_runs,
     new_figure,
@@ -78,13 +79,13 @@ def plot_signal(
     'x [deg/h]'
     """
     log = as_log(log)
-    if columns < 1:
-        raise OptionError(f"columns={columns!r}: give a number above 0, for instance 1500")
+    check_columns(columns)
     name = signal_name(log)
     axes, available = axis_names(log, axis), log_channels(log)
-    channels = [channels] if isinstance(channels, str) else channels
-    shown = available if channels is None else list(channels)
-    if missing := [channel for channel in shown if channel not in available]:
+    is_single = isinstance(channels, str) or not np.iterable(channels)
+    chosen: Any = [channels] if is_single else channels
+    shown = available if channels is None else list(chosen)
+    if missing := [str(channel) for channel in shown if channel not in available]:
         raise OptionError(
             f"channel {', '.join(missing)} is not in the log; "
             f"it has {', '.join(available) or 'none'}"

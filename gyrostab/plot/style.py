@@ -119,6 +119,12 @@ def axis_names(dataset: xr.Dataset, axis: str | None = None) -> list[str]:
     return [axis]
 
 
+def check_columns(columns: Any) -> None:
+    """Raise `OptionError` unless this is a number of columns to which a record is reduced."""
+    if not (isinstance(columns, int | np.integer) and columns >= 1):
+        raise OptionError(f"columns={columns!r}: give a whole number above 0, for instance 1500")
+
+
 def axis_style(dataset: xr.Dataset, axis: str) -> dict[str, Any]:
     """Choose colour and marker of an axis: by name if all are x, y or z, else by its place."""
     names = axis_names(dataset)

@@ -15,6 +15,7 @@ from gyrostab.plot.style import (
     INCH_MM,
     PAGE_MM,
     axis_names,
+    check_columns,
     draws_figure,
     is_narrow,
     label_log_axis,
@@ -218,8 +219,7 @@ def _merge_windows(
 
     The cells of an axis are the Allan deviation and the mask of weighted cells, shape (time, tau).
     """
-    if columns < 1:
-        raise OptionError(f"columns={columns!r}: give a number above 0, for instance 1500")
+    check_columns(columns)
     merged = max(1, -(-product.sizes["time"] // columns))
     part = product[["avar", "estimator"]].sel(axis=names).drop_vars("time").compute()
     is_weighted = (part["estimator"] == _WEIGHTED).astype(np.float64)

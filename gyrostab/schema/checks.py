@@ -420,7 +420,8 @@ def check_coefficients(product: xr.Dataset) -> None:
     require_dataset(product, "product")
     if "observable" not in product.variables:
         raise SchemaError(
-            "this holds no coefficients yet; call gyrostab.fit_noise (or 'gyrostab fit') first"
+            "this is not a product: it holds no coefficients yet; call gyrostab.fit_noise (or "
+            "'gyrostab fit') first"
         )
     names = [f"{term}{end}" for term in TERMS for end in ("", "_stderr", "_upper")]
     dims = {"axis": ("axis",), "time": ("time",), **dict.fromkeys(names, ("axis", "time"))}

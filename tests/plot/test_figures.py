@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from gyrostab.cli import main
-from gyrostab.errors import OutputError, SchemaError
+from gyrostab.errors import OptionError, OutputError, SchemaError
 from gyrostab.io.datasets import to_netcdf
 from gyrostab.noise import LAWS
 from gyrostab.plot import plot_coefficients, plot_davar, plot_signal
@@ -196,8 +196,11 @@ def test_each_axis_has_its_own_figures(monkeypatch, tmp_path):
 
 
 def test_wrong_input_and_existing_figures_are_refused(tmp_path):
-    with pytest.raises(SchemaError, match="no variable"):
+    with pytest.raises(SchemaError, match="no coefficients yet"):
         save_figures(synthetic.surface(), tmp_path)
+    for dpi in (0, "300"):
+        with pytest.raises(OptionError, match=f"dpi={dpi!r}: give pixels per inch, above 0"):
+            save_figures(synthetic.product(), tmp_path, dpi=dpi)
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="is a file; give the name of a folder"):
         save_figures(synthetic.product(), tmp_path / "file")

@@ -62,11 +62,14 @@ def test_signal_of_chosen_axis_and_channels():
     assert [ax.get_ylabel() for ax in figure.axes] == ["z [deg/h]", "temperature\n[°C]"]
     with pytest.raises(OptionError, match="channel mud is not in the log; it has vibration"):
         plot_signal(synthetic.log(), channels="mud")
-    with pytest.raises(OptionError, match="columns=0: give a number above 0"):
-        plot_signal(synthetic.log(), columns=0)
-    for draw in (plot_davar, plot_davar_3d):
-        with pytest.raises(OptionError, match="columns=0: give a number above 0"):
-            draw(synthetic.product(), columns=0)
+    with pytest.raises(OptionError, match="channel 3 is not in the log"):
+        plot_signal(synthetic.log(), channels=3)
+    for columns in (0, 1.5, "9"):
+        with pytest.raises(OptionError, match=f"columns={columns!r}: give a whole number above 0"):
+            plot_signal(synthetic.log(), columns=columns)
+        for draw in (plot_davar, plot_davar_3d):
+            with pytest.raises(OptionError, match=f"columns={columns!r}: give a whole number"):
+                draw(synthetic.product(), columns=columns)
     with pytest.raises(OptionError, match="axis 'q' is not in the data; it has x, y, z"):
         plot_signal(synthetic.log(), axis="q")
 
