@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from gyrostab.allan.variance import variance_name
+from gyrostab.diagnose.result.diagnosis import Diagnosis
 from gyrostab.errors import SchemaError
 from gyrostab.ingest.convert import as_log
 from gyrostab.noise import LAWS
@@ -74,6 +75,10 @@ def write_report(
     ...     path.name, "plotly" in path.read_text(encoding="utf-8")
     ('report.html', True)
     """
+    if isinstance(product, Diagnosis):
+        raise SchemaError(
+            "this is a diagnosis, not a product; gyrostab.write_diagnosis writes its report"
+        )
     product = with_axis(product)
     check_product(product)
     if log is not None:

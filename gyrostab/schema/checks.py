@@ -221,6 +221,8 @@ def _advise_dimensions(has: tuple[Hashable, ...], expected: tuple[str, ...]) -> 
             "data_vars='minimal'; instead of .where(...), which repeats every variable along "
             f"{extra[0]!r}, select with .isel({extra[0]}=...)"
         )
+    if len(extra) > len(lost):
+        return f"select one label of {extra[0]!r}: .isel({extra[0]}=0)"
     return f"rename {extra[0]!r} to {lost[0]!r}"
 
 

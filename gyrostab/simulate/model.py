@@ -190,7 +190,8 @@ def _read_tables(
     if not isinstance(model, str | os.PathLike):
         raise OptionError(
             f"the model is of type {type(model).__name__}; give a TOML file, a mapping of its "
-            "tables, or what gyrostab.read_model returns"
+            "tables, such as that of a diagnosis (diagnosis.model), or what gyrostab.read_model "
+            "returns"
         )
     path = Path(model)
     try:

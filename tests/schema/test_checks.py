@@ -30,6 +30,10 @@ def product() -> xr.Dataset:
             r"\.transpose\('axis', 'time', 'tau', \.\.\.\).*engine='gyrostab'",
         ),
         (lambda p: p.rename(axis="sensor"), "rename 'sensor' to 'axis'"),
+        (
+            lambda p: p.rename(time="window").expand_dims(case=["before", "after"]),
+            r"select one label of 'case': \.isel\(case=0\)$",
+        ),
         (lambda p: p.drop_vars("Q_upper"), "no variable 'Q_upper'"),
         (lambda p: p.sel(term=["N", "B"]), "'term' of the product holds N, B, expected Q, N"),
         (lambda p: p.assign_coords(axis=[1, 2, 3]), r"'axis' of the .* holds 1, 2, 3, not names"),

@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import gyrostab
 from gyrostab.diagnose.result.content import VERDICTS, check_diagnosis, make_schema
 from gyrostab.diagnose.result.diagnosis import Diagnosis, model_text, tabulate_effect, to_json_types
 from gyrostab.diagnose.result.record_text import summary
@@ -29,7 +30,7 @@ from gyrostab.diagnose.result.text import (
     rejection_text,
     unsized_statement,
 )
-from gyrostab.errors import FormatError, OutputError, SchemaError
+from gyrostab.errors import FormatError, OptionError, OutputError, SchemaError
 from gyrostab.physics.registry import effects, make_effect
 from gyrostab.report import write_diagnosis_report
 from gyrostab.report.diagnosis import FILES, open_diagnosis, write_diagnosis
@@ -240,6 +241,10 @@ def test_folder_of_four_files_round_trips(tmp_path: Path):
         open_diagnosis(tmp_path / "found" / "diagnosis.json")
     with pytest.raises(SchemaError, match="this is a dict, not a diagnosis; gyrostab"):
         write_diagnosis(made.content, tmp_path / "other")
+    with pytest.raises(SchemaError, match=r"gyrostab\.write_diagnosis writes its report"):
+        gyrostab.write_report(made, tmp_path / "report.html")
+    with pytest.raises(OptionError, match=r"of type Diagnosis; give .* \(diagnosis\.model\)"):
+        gyrostab.read_model(made)
     assert repr(made) == str(made)
     opened = open_diagnosis(tmp_path / "found")
     assert opened.content == json.loads(made.to_json())
