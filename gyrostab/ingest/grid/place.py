@@ -36,11 +36,6 @@ from gyrostab.time.grid import period_ns
 from gyrostab.time.stamps import format_stamp
 from gyrostab.wording import format_rounded
 
-NO_STAMPS = (
-    "{where}: no row has a readable stamp; check the time column and its unit (--map), "
-    "or give --rate HZ for a log without time"
-)
-
 #: Largest distance of the smoothed stamps from the grid before a sample is skipped [samples].
 HOLD = 0.75
 
@@ -172,7 +167,10 @@ def place_by_stamp(stamps: Stamps, rate: float, *, max_gap: float, where: str) -
         runs.append(new)
         events.append(happened)
     if not state[kernel.STARTED]:
-        raise TimeError(NO_STAMPS.format(where=where))
+        raise TimeError(
+            f"{where}: no row has a readable stamp; check the time column and its unit (--map), "
+            "or give --rate HZ for a log without time"
+        )
     runs.append(state[kernel.OPEN_RUN][None])
     return make_placement(_find_start(first, period), rate, runs, events)
 

@@ -7,10 +7,9 @@ from itertools import pairwise
 import numpy as np
 
 from gyrostab.arrays import Ints
-from gyrostab.errors import TimeError
 from gyrostab.ingest.gap_table import is_restart
 from gyrostab.ingest.grid.jitter import GAIN, MIN_SIGMA, TRACE_ROWS, JitterModel, observe_rows
-from gyrostab.ingest.grid.place import HOLD, NO_STAMPS, Placement, append_runs, make_placement
+from gyrostab.ingest.grid.place import HOLD, Placement, append_runs, make_placement
 from gyrostab.ingest.grid.starting_period import SECOND, Stamps, recut_blocks
 from gyrostab.kernels.grid.course import find_breaks, find_phase, trace
 from gyrostab.kernels.grid.stamps import DUPLICATE, RESTART, STEP
@@ -139,12 +138,12 @@ class _Placer:
 
 
 def place_in_order(
-    stamps: Stamps, jitter: JitterModel, rate: float, *, max_gap: float, by_row: bool, where: str
+    stamps: Stamps, jitter: JitterModel, rate: float, *, max_gap: float, by_row: bool
 ) -> Placement:
     """Place rows in order, for stamps with jitter: see `gyrostab.ingest.grid.jitter`.
 
-    With `by_row`, rows that `stamps` leaves out occupy samples. Other options are those of
-    `place_by_stamp`.
+    Some stamps are readable. A step ahead above `max_gap` [s] is a step of the clock. With
+    `by_row`, rows that `stamps` leaves out occupy samples.
     """
     ahead = int(min(_AHEAD_ROWS * np.ceil(jitter.group), _MAX_AHEAD_ROWS))
     size = int(min(TRACE_ROWS * np.ceil(jitter.group), _MAX_ROWS))
@@ -152,6 +151,5 @@ def place_in_order(
     for number, (rows, values) in enumerate(recut_blocks(stamps, size, ahead)):
         count = rows if by_row else np.arange(number * size, number * size + len(rows))
         placer.add(rows, count, values, size if len(rows) == size + ahead else len(rows))
-    if placer.start is None:
-        raise TimeError(NO_STAMPS.format(where=where))
+    assert placer.start is not None
     return make_placement(placer.start, rate, placer.runs, placer.events)

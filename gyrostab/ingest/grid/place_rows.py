@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -33,6 +32,7 @@ from gyrostab.kernels.grid.stamps import (
     DUPLICATE,
     EVENT_BEFORE,
     EVENT_ROW,
+    EVENT_SAMPLE,
     EVENT_STAMP,
     NO_STAMP,
     RESTART,
@@ -132,9 +132,7 @@ class RowPlacer:
             if _is_sharp(estimate.jitter):
                 deviating = deviating_stretches(stamps, 1e9 / rate)
         in_longer = np.isin(doubled[:, 0], placement.events[:, EVENT_ROW])
-        doubled = doubled[~in_longer]
-        if len(doubled):
-            placement = _with_duplicates(placement, [_duplicate_events(placement, *doubled.T)])
+        placement = _add_duplicates(placement, [doubled[~in_longer]])
         notes += describe_rate(raw, estimate, deviating, placement)
         changes = tuple(
             end[1]
@@ -204,20 +202,21 @@ class RowPlacer:
         self, stamps: Stamps, jitter: JitterModel | None, rate: float, count_all_rows: bool
     ) -> Placement:
         """Place rows by their stamps, or in order if stamps have jitter."""
-        scanned = self.scanned
-        options: dict[str, Any] = {"max_gap": self.max_gap, "where": self.where}
+        scanned, max_gap = self.scanned, self.max_gap
 
         def place_along(jitter: JitterModel) -> Placement:
             def place() -> Placement:  # repetitions occupy no samples
                 by_row = count_all_rows and not scanned.repeated_count
-                return place_in_order(stamps, jitter, rate, by_row=by_row, **options)
+                return place_in_order(stamps, jitter, rate, max_gap=max_gap, by_row=by_row)
 
             return self._place_once(place)
 
         if jitter is not None and not _is_sharp(jitter):
             return place_along(jitter)
         repeated_before = scanned.repeated_count
-        placement = self._place_once(partial(place_by_stamp, stamps, rate, **options))
+        placement = self._place_once(
+            partial(place_by_stamp, stamps, rate, max_gap=max_gap, where=self.where)
+        )
         dropped = (
             scanned.row_count
             - scanned.absent_count
@@ -234,42 +233,42 @@ class RowPlacer:
 
     def _place_once(self, place: Callable[[], Placement]) -> Placement:
         """Place each sample once; repeated stretches of rows are duplicates, not clock restarts."""
-        placement, all_repeats = place(), np.empty((0, 3), dtype=np.int64)
+        placement, all_repeats = place(), list[Ints]()
         for _ in range(_MAX_ROUNDS):
             repeats = find_repeats(self.raw, placement)
-            if not len(repeats):
+            if not repeats:
                 break
-            for row, _source, length in repeats.tolist():
-                self.scanned.leave_out(np.arange(row, row + length))
-            all_repeats = np.concatenate([all_repeats, repeats])
+            self.scanned.leave_out(np.concatenate(repeats)[:, 0])
+            all_repeats += repeats
             placement = place()
-        return with_repeats(placement, self.raw, all_repeats) if len(all_repeats) else placement
+        return _add_duplicates(placement, all_repeats)
 
 
 def _is_sharp(jitter: JitterModel | None) -> bool:
     return jitter is None or jitter.sigma <= _SHARP_SIGMA
 
 
-def find_repeats(raw: xr.Dataset, placement: Placement) -> Ints:
+def find_repeats(raw: xr.Dataset, placement: Placement) -> list[Ints]:
     """Find the rows after each set-back of the clock that repeat rows before it.
 
     Rows are equal if their stamps and values are. A clock that restarts may write the same stamps
     again, but with other values; values that never change are not taken as a repetition.
 
-    Returns (n, 3): first row of the repetition, first row of what it repeats, number of rows.
+    Returns a table for each repetition, (n, 3): row, the row that it repeats, and its stamp [ns].
     """
     breaks = placement.events_of(STEP, RESTART)
     back = breaks[breaks[:, EVENT_STAMP] < breaks[:, EVENT_BEFORE]]
-    repeats: list[tuple[int, int, int]] = []
-    for row, stamp in sorted(zip(back[:, 2].tolist(), back[:, 4].tolist(), strict=True)):
-        if repeats and row < repeats[-1][0] + repeats[-1][2]:
+    repeats: list[Ints] = []
+    for row, stamp in sorted(back[:, [EVENT_ROW, EVENT_STAMP]].tolist()):
+        if repeats and row <= repeats[-1][-1, 0]:
             continue
         for source in _rows_at(raw, stamp, row):
             length = _count_repeated(raw, source, row)
             if length >= _MIN_ROWS:
-                repeats.append((row, source, length))
+                rows, stamps = np.arange(length), read_stamps(raw, row, row + length)
+                repeats.append(np.stack([rows + row, rows + source, stamps], axis=1))
                 break
-    return np.array(repeats, dtype=np.int64).reshape(-1, 3)
+    return repeats
 
 
 def _growing_blocks(rows: int) -> Iterator[tuple[int, int]]:
@@ -348,22 +347,15 @@ def find_doubled(raw: xr.Dataset) -> Ints:
     return np.stack([rows, source, stamps], axis=1)
 
 
-def with_repeats(placement: Placement, raw: xr.Dataset, repeats: Ints) -> Placement:
-    """Add repeated rows as duplicates to the events of a placement made without them."""
-    tables = []
-    for row, source, length in repeats.tolist():
-        rows, stamps = np.arange(length), read_stamps(raw, row, row + length)
-        table = _duplicate_events(placement, rows + row, rows + source, stamps)
-        tables.append(table[stamps != NO_STAMP])
-    return _with_duplicates(placement, tables)
+def _add_duplicates(placement: Placement, repeats: Sequence[Ints]) -> Placement:
+    """Add stamped rows that repeat others as duplicates to the events of a placement without them.
 
-
-def _duplicate_events(placement: Placement, rows: Ints, source: Ints, stamps: Ints) -> Ints:
-    """Return events of rows that repeat those of `source`."""
-    sample = np.maximum.accumulate(np.maximum(placement.samples_of(source), 0))
-    return np.stack([np.full(len(rows), DUPLICATE), sample, rows, stamps, stamps], axis=1)
-
-
-def _with_duplicates(placement: Placement, tables: Sequence[Ints]) -> Placement:
-    table = np.concatenate([placement.events, *tables])
-    return replace(placement, events=table[np.argsort(table[:, 1], kind="stable")])
+    The tables are those of `find_repeats` and `find_doubled`.
+    """
+    events = [placement.events]
+    for row, source, stamp in (table.T for table in repeats):
+        sample = np.maximum.accumulate(np.maximum(placement.samples_of(source), 0))
+        table = np.stack([np.full_like(row, DUPLICATE), sample, row, stamp, stamp], axis=1)
+        events.append(table[stamp != NO_STAMP])
+    table = np.concatenate(events)
+    return replace(placement, events=table[np.argsort(table[:, EVENT_SAMPLE], kind="stable")])
