@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +10,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from gyrostab.errors import (
-    GyrostabError,
-    MissingUnitError,
-    OptionError,
-    SchemaError,
-    TimeError,
-    UnitError,
-)
+from gyrostab.errors import MissingUnitError, OptionError, SchemaError, TimeError, UnitError
 from gyrostab.ingest.columns.headers import quantity_of
 from gyrostab.ingest.combine import warn_notes
 from gyrostab.ingest.dataframe import from_dataframe, keyword_advice
@@ -69,12 +60,12 @@ def as_log(data: Any, *, converts_channels: bool = True) -> xr.Dataset:
         unknown.
     """
     if isinstance(data, xr.DataArray):
-        with _advise_conversion("gyrostab.from_dataarray(da, ...)"):
+        with keyword_advice("gyrostab.from_dataarray(da, ...)"):
             log = as_uniform(_dataset_of(data, None, None)[0])
         warn_notes(log)
         return log
     if isinstance(data, pd.DataFrame | pd.Series):
-        with _advise_conversion("gyrostab.from_dataframe(df, ...)"):
+        with keyword_advice("gyrostab.from_dataframe(df, ...)"):
             return from_dataframe(data)
     if isinstance(data, xr.Dataset):
         data = _decode_packed(_reset_channels(_keep_on_disk(data)))
@@ -135,19 +126,6 @@ def _convert_units(log: xr.Dataset, *, channels: bool = True) -> xr.Dataset:
                 data = variable.data * unit.factor + unit.offset
                 converted[name] = xr.Variable(variable.dims, data, attrs)
     return log.assign(converted) if converted else log
-
-
-@contextmanager
-def _advise_conversion(call: str) -> Iterator[None]:
-    """Let errors that advise options of a conversion name the function that takes them."""
-    try:
-        yield
-    except GyrostabError as error:
-        if re.search(r"\b(kind|map|max_gap|rate|units)=", str(error)) and "gyrostab." not in str(
-            error
-        ):
-            error.args = (f"{error}; {call} has these options and returns a log",)
-        raise
 
 
 def _keep_on_disk(log: xr.Dataset) -> xr.Dataset:

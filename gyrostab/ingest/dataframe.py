@@ -25,6 +25,7 @@ _OPTION = re.compile(
     r'(?: ("[^"]*=[^"]*"|[^\s,;:()]+=[^\s,;:()]+)'
     r"|(?<=kind) (angle|rate)\b|(?<=rate|alue) (HZ|[\d.e+-]+))?"
 )
+_KEYWORD = re.compile(r"\b(kind|map|max_gap|rate|units)=")
 #: Patterns of advice that only concerns files, and their replacements.
 _FILE_ADVICE = (
     ("; gyrostab scan DataFrame inspects each column", ""),
@@ -194,12 +195,18 @@ def _make_options(
 
 
 @contextmanager
-def keyword_advice() -> Iterator[None]:
-    """Let errors name keywords of functions, where those on files name options of commands."""
+def keyword_advice(call: str = "") -> Iterator[None]:
+    """Let errors name keywords of functions, where those on files name options of commands.
+
+    They also name the `call` that takes the keywords, if it is given.
+    """
     try:
         yield
     except GyrostabError as error:
-        error.args = (_name_keywords(str(error)),)
+        message = _name_keywords(str(error))
+        if call and _KEYWORD.search(message) and "gyrostab." not in message:
+            message += f"; {call} has these options and returns a log"
+        error.args = (message,)
         raise
 
 

@@ -139,13 +139,11 @@ def runs_of(first: int, off: float, size: int, ratio: float) -> Ints:
     return np.stack([first + begin + shift(begin), begin, end - begin], axis=1)
 
 
-Table = Ints
-
-_EMPTY: Table = np.empty((0, 5), dtype=np.int64)
+_EMPTY: Ints = np.empty((0, 5), dtype=np.int64)
 _MAX_SAMPLE = np.iinfo(np.int64).max // 2
 
 
-def _own_gaps(piece: PlacedLog) -> Table:
+def _own_gaps(piece: PlacedLog) -> Ints:
     """Return the table of gaps of one log, on the common grid."""
     table = read_gaps(piece.source.log, piece.source.start, piece.source.rate)
     if table is None:
@@ -163,7 +161,7 @@ def _own_gaps(piece: PlacedLog) -> Table:
     return np.concatenate([table, slips])
 
 
-def _missing_in_both(held: Table, new: Table) -> Table:
+def _missing_in_both(held: Ints, new: Ints) -> Ints:
     """Return the samples missing in both logs, with the causes and the events of the first."""
     lines = [held[held[:, FIRST] == held[:, END]]]
     lines += [
@@ -174,7 +172,7 @@ def _missing_in_both(held: Table, new: Table) -> Table:
     return np.concatenate(lines)
 
 
-def merge_gaps(pieces: Sequence[PlacedLog]) -> Table:
+def merge_gaps(pieces: Sequence[PlacedLog]) -> Ints:
     """Return the table of gaps of the concatenated log; a gap on some axes counts as a gap.
 
     Its columns are those of `gyrostab.ingest.gap_table.COLUMNS`, sorted by sample.
@@ -191,9 +189,9 @@ def merge_gaps(pieces: Sequence[PlacedLog]) -> Table:
     return sort_gaps(np.unique(np.concatenate(tables), axis=0))  # a gap of several axes is one line
 
 
-def _merge_group(pieces: Sequence[PlacedLog], begin: int, stop_at: int | None) -> Table:
+def _merge_group(pieces: Sequence[PlacedLog], begin: int, stop_at: int | None) -> Ints:
     """Return the gaps of logs that share axes, from `begin` on and up to `stop_at` if given."""
-    tables: list[Table] = []
+    tables: list[Ints] = []
     firsts: list[int] = []
     ends: list[int] = []
     end = begin

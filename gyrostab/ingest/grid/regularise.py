@@ -291,7 +291,9 @@ def _place_log(
     is_increment = raw.attrs.get("kind") == "increment"
     kind = "rate" if is_increment else name
     to_rate = hertz * HOUR  # degree a sample to degree an hour
-    data, packing = _place_signal(raw[name], placement, chunk, to_rate if is_increment else 1.0)
+    unit, scale = raw[name].encoding.get("scale_factor"), to_rate if is_increment else 1.0
+    data = rows_on_grid(raw[name].data, placement, chunk=chunk, scale=scale, unit=unit)
+    packing = {**raw[name].encoding, "scale_factor": unit * scale} if unit else {}
     if _has_unknown_turns(table, known_steps):
         data, packing, kind = differentiate_angles(data, to_rate), {}, "rate"
         table = _end_gaps_later(table, size)
@@ -314,15 +316,6 @@ def _place_log(
     if placement.rate_changes:
         log.attrs["rate_changes"] = list(map(format_stamp, placement.rate_changes))
     return log.assign_attrs(notes=[*log.attrs["notes"], *describe_channels(log)])
-
-
-def _place_signal(
-    signal: xr.DataArray, placement: Placement, chunk: int, scale: float
-) -> tuple[Any, dict[Any, Any]]:
-    """Place a signal by row on the grid, times `scale`; also return its encoding."""
-    unit = signal.encoding.get("scale_factor")
-    data = rows_on_grid(signal.data, placement, chunk=chunk, scale=scale, unit=unit)
-    return data, {**signal.encoding, "scale_factor": unit * scale} if unit else {}
 
 
 def _scale_samples(out: Floats, *, scale: float, unit: float | None) -> None:

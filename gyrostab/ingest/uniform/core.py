@@ -30,8 +30,6 @@ from gyrostab.store.private import close_function, is_in_memory
 from gyrostab.time.grid import TimeGridIndex, time_coordinate
 from gyrostab.time.stamps import to_nanoseconds
 
-Table = Ints
-
 #: Largest variable that stays in memory after placing [numbers]; 16 MB.
 SMALL_SIZE = 2**21
 #: Chunk length of variables that were in memory [samples].
@@ -223,7 +221,7 @@ def place_samples(log: xr.Dataset, grid: UniformGrid) -> xr.Dataset:
     return placed_log
 
 
-def _change_rate(table: Table, ratio: float) -> Table:
+def _change_rate(table: Ints, ratio: float) -> Ints:
     """Convert a table for a log of which every n-th sample was selected; `ratio` is 1 / n."""
     old_length = table[:, END] - table[:, FIRST]
     table = table.copy()
@@ -237,7 +235,7 @@ def _change_rate(table: Table, ratio: float) -> Table:
     return np.asarray(table[~lost])
 
 
-def _add_holes(table: Table, runs: Table) -> Table:
+def _add_holes(table: Ints, runs: Ints) -> Ints:
     """Add the samples between runs that the table does not list, with cause "missing"."""
     first, end = runs[:-1, 0] + runs[:-1, 2], runs[1:, 0]
     begin, stop = merge_spans([table[table[:, END] > table[:, FIRST]][:, [FIRST, END]]]).T
@@ -259,7 +257,7 @@ def _add_holes(table: Table, runs: Table) -> Table:
     return sort_gaps(np.concatenate([table, holes]))
 
 
-def merge_spans(spans: Sequence[Table]) -> Table:
+def merge_spans(spans: Sequence[Ints]) -> Ints:
     """Return the union of half-open spans (first, end), in order."""
     table = np.concatenate([*spans, np.empty((0, 2), np.int64)])
     first, end = table[np.argsort(table[:, 0], kind="stable")].T
@@ -269,14 +267,14 @@ def merge_spans(spans: Sequence[Table]) -> Table:
     return np.stack([first[np.append(edge, is_apart)], end[np.append(is_apart, edge)]], axis=1)
 
 
-def add_spans(table: Table, spans: Table, cause: int) -> Table:
+def add_spans(table: Ints, spans: Ints, cause: int) -> Ints:
     """Add spans of samples (first, end) of one cause to a table."""
     length = spans[:, 1] - spans[:, 0]
     lines = np.column_stack([spans, length, np.zeros_like(length), np.full_like(length, cause)])
     return sort_gaps(np.concatenate([table, lines]))
 
 
-def with_table(log: xr.Dataset, table: Table | None, grid: UniformGrid) -> xr.Dataset:
+def with_table(log: xr.Dataset, table: Ints | None, grid: UniformGrid) -> xr.Dataset:
     """Replace the table of gaps of a log on this grid; None removes it."""
     bare = log.drop_vars(
         [name for name, variable in log.variables.items() if "gap" in variable.dims]
