@@ -154,31 +154,12 @@ def read_log(
             f"{regular[0].name} is a regular log already and {raw.name} is not; convert the raw "
             "logs with gyrostab ingest, and then read all of them together"
         )
-    if not regular:
-        names = sorted(parts, key=name_key)
-        parts.update(zip(names, continue_clocks([parts[path] for path in names]), strict=True))
     channels = [read_file(path, replace(options, channels_only=True, start=None)) for path in extra]
-    spans = _find_lost_spans(lost, parts, options) if lost else {}
     if regular:
-        log = concatenate_logs(
-            [_check_regular(part, path.name, options) for path, part in parts.items()],
-            regular,
-            max_gap=longest_gap,
-            lost=list(spans.values()),
-            limits=options.limits,
-        )
+        log = _join_regular(parts, lost, options, longest_gap)
     else:
-        refuse_unused_options([*parts.values(), *channels])
-        log = concatenate(list(parts.values()))
-        if lost and "time" not in log.variables:
-            raise FormatError(
-                f"{next(iter(lost.values()))}; the files have no time stamps, so the time of "
-                "those that follow it is not known: repair it"
-            )
-        if spans:
-            # regularise marks the gaps there
-            log.attrs["unreadable_spans"] = [list(span) for span in spans.values()]
-    log = attach_channels(_add_lost_notes(log, lost, spans), channels)
+        log = _join_raw(parts, lost, options, channels)
+    log = attach_channels(log, channels)
     if channels:
         log.attrs["notes"] = [note for part in (log, *channels) for note in texts(part, "notes")]
         log.attrs["channel_files"] = [part.attrs["source_files"][0] for part in channels]
@@ -272,6 +253,40 @@ def _read_all(
     return parts, lost
 
 
+def _join_regular(
+    parts: Mapping[Path, xr.Dataset], lost: LostFiles, options: ReadOptions, max_gap: float
+) -> xr.Dataset:
+    """Join regular logs to one."""
+    logs = [_check_regular(part, path.name, options) for path, part in parts.items()]
+    spans = _find_lost_spans(lost, parts, options)
+    gaps, limits = list(spans.values()), options.limits
+    log = concatenate_logs(logs, list(parts), max_gap=max_gap, lost=gaps, limits=limits)
+    return _add_lost_notes(log, lost, spans)
+
+
+def _join_raw(
+    parts: dict[Path, xr.Dataset],
+    lost: LostFiles,
+    options: ReadOptions,
+    channels: Sequence[xr.Dataset],
+) -> xr.Dataset:
+    """Join raw logs to one; the options may concern the files with `channels` too."""
+    by_name = sorted(parts, key=name_key)
+    parts |= zip(by_name, continue_clocks([parts[path] for path in by_name]), strict=True)
+    spans = _find_lost_spans(lost, parts, options)
+    refuse_unused_options([*parts.values(), *channels])
+    log = concatenate(list(parts.values()))
+    if lost and "time" not in log.variables:
+        raise FormatError(
+            f"{next(iter(lost.values()))}; the files have no time stamps, so the time of "
+            "those that follow it is not known: repair it"
+        )
+    if spans:
+        # regularise marks the gaps there
+        log.attrs["unreadable_spans"] = [list(span) for span in spans.values()]
+    return _add_lost_notes(log, lost, spans)
+
+
 def _check_regular(log: xr.Dataset, name: str, options: ReadOptions) -> xr.Dataset:
     """Refuse options that contradict a regular log, and note options that have no effect on it."""
     if options.rate is not None:
@@ -330,6 +345,8 @@ def _find_lost_spans(
     follow each other in time; `parts` are the files that were read. Otherwise the stamps that are
     still readable are used.
     """
+    if not lost:
+        return {}
     spans = {
         path: log_span(part) if "sampling_rate_hz" in part.attrs else stamp_span(part)
         for path, part in parts.items()
