@@ -34,13 +34,14 @@ MISSING, UNREADABLE, DUPLICATE, OUTSIDE_RANGE, CLOCK_STEP, RESTART = map(
 )
 
 
-def is_restart(first: float, begin: float, before: float, after: float) -> bool:
-    """Return whether a clock that steps back restarts, rather than being corrected.
+def break_cause(first: float, begin: float, before: float, after: float) -> int:
+    """Return the cause of a step of a clock: one that steps back restarts, or is corrected.
 
     It began at `first`, and `begin` was its first stamp after the last step.
     """
     elapsed = before - begin
-    return after <= first + 0.1 * elapsed or 2 * (before - after) > elapsed
+    is_restart = after <= first + 0.1 * elapsed or 2 * (before - after) > elapsed
+    return RESTART if after < before and is_restart else CLOCK_STEP
 
 
 def describe_break(place: str, cause: int, before: int, after: int, samples: str) -> str:

@@ -15,12 +15,7 @@ import numpy as np
 
 from gyrostab.arrays import Floats
 from gyrostab.ingest.concat.grid import PlacedLog, SourceLog, read_log_slice, runs_of
-from gyrostab.ingest.gap_table import (
-    CLOCK_STEP,
-    RESTART,
-    describe_break,
-    is_restart,
-)
+from gyrostab.ingest.gap_table import break_cause, describe_break
 from gyrostab.time.durations import format_measured_duration
 from gyrostab.time.grid import grid_index, grid_times
 from gyrostab.time.stamps import format_stamp
@@ -122,9 +117,8 @@ def _place_next(
     first, end = int(np.rint(position)), max(piece.end for piece in pieces)
     back = end - first > MAX_OVERLAP_SAMPLES and differing is not None
     if back or first - end > max_gap * rate:
-        ends = clock[0], _last_stamp(pieces), source.start
-        is_new = back and is_restart(pieces[0].source.start, *ends)
-        cause = RESTART if is_new else CLOCK_STEP
+        began, last = pieces[0].source.start, _last_stamp(pieces)
+        cause = break_cause(began, clock[0], last, source.start)
         return _place_at(end + 1, source, rate, (source.start, end + 1), cause), None
     overlapped = (differing or silent) if first < end else None
     return _place_at(position, source, rate, clock), overlapped

@@ -17,8 +17,6 @@ from gyrostab.kernels.grid.stamps import (
     EVENT_ROW,
     EVENT_SAMPLE,
     OUT_OF_ORDER,
-    RESTART,
-    STEP,
 )
 from gyrostab.schema import GAP_CAUSES, signal_name
 
@@ -36,7 +34,7 @@ def _missing_samples(placement: Placement, scanned: ScanPass) -> Ints:
     listed_between = np.searchsorted(listed_rows, row_start) - np.searchsorted(listed_rows, row_end)
     skipped = np.maximum(row_start - row_end - listed_between, 0)
     cause = np.where(skipped > 0, UNREADABLE, MISSING)
-    broken = placement.events_of(STEP, RESTART)
+    broken = placement.breaks
     if len(broken):
         at = np.minimum(np.searchsorted(broken[:, EVENT_SAMPLE], end), len(broken) - 1)
         at_break = broken[at, EVENT_SAMPLE] == end
@@ -76,7 +74,7 @@ def _dropped_rows(placement: Placement) -> Ints:
 def find_gaps(placement: Placement, scanned: ScanPass) -> Ints:
     """Make the table of all gaps in samples, with the columns of `ingest.gap_table.COLUMNS`."""
     unreadable = [scanned.unreadable]
-    if placement.placed_count > scanned.row_count - scanned.absent_count - scanned.repeated_count:
+    if placement.placed_count > scanned.present_count - scanned.repeated_count:
         # rows without any number have samples too, because they count
         absent = [
             find_spans(~scanned.mask(begin, min(begin + BLOCK_ROWS, scanned.row_count)), begin)

@@ -7,13 +7,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from gyrostab.arrays import Floats, Ints
-from gyrostab.ingest.gap_table import (
-    CLOCK_STEP,
-    MISSING,
-    RESTART,
-    describe_break,
-    describe_clock_change,
-)
+from gyrostab.ingest.gap_table import MISSING, describe_break, describe_clock_change
 from gyrostab.ingest.grid.jitter import MIN_SIGMA
 from gyrostab.ingest.grid.place import Placement
 from gyrostab.ingest.grid.rate import DeviatingStretch, RateEstimate
@@ -214,7 +208,7 @@ def _describe_deviating(
 
 def _describe_breaks(raw: xr.Dataset, placement: Placement) -> list[str]:
     notes = []
-    events = placement.events_of(CLOCK_STEP, RESTART)
+    events = placement.breaks
     for cause, _sample, row, before, after in events[:_MAX_NAMED].tolist():
         file, local = file_of(raw, row)
         text = describe_break(f" at row {local}", cause, before, after, "rows")
@@ -290,7 +284,7 @@ def describe_placement(
             f"{n_placed} were put in their place, {len(late) - n_placed} dropped"
         )
     dropped = len(twice) + len(late) - n_placed
-    lost = scanned.row_count - scanned.absent_count - placement.placed_count - dropped
+    lost = scanned.present_count - placement.placed_count - dropped
     if lost > 0:
         notes.append(
             f"{where}: dropped without a readable time stamp: {_count_of(lost, 'row')} whose "

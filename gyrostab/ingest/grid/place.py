@@ -13,24 +13,12 @@ import xarray as xr
 from gyrostab.arrays import Array, Floats, Ints
 from gyrostab.errors import TimeError
 from gyrostab.ingest.columns.stamps import read_stamps
-from gyrostab.ingest.gap_table import is_restart
+from gyrostab.ingest.gap_table import break_cause
 from gyrostab.ingest.grid.rate import RateEstimate
 from gyrostab.ingest.grid.scan_pass import file_of
 from gyrostab.ingest.grid.starting_period import Stamps, readable_stamps, recut_blocks
 from gyrostab.ingest.limits import describe_limit, is_absurd_grid
 from gyrostab.kernels.grid import stamps as kernel
-from gyrostab.kernels.grid.stamps import (
-    DUPLICATE,
-    EVENT_CAUSE,
-    EVENT_COLUMNS,
-    EVENT_ROW,
-    EVENT_SAMPLE,
-    LOOK_AHEAD,
-    NO_STAMP,
-    OUT_OF_ORDER,
-    RESTART,
-    STEP,
-)
 from gyrostab.time.durations import format_measured_duration
 from gyrostab.time.grid import period_ns
 from gyrostab.time.stamps import format_stamp
@@ -81,12 +69,17 @@ class Placement:
 
     def events_of(self, *causes: int) -> Ints:
         """Return the events of some causes."""
-        return self.events[np.isin(self.events[:, EVENT_CAUSE], causes)]
+        return self.events[np.isin(self.events[:, kernel.EVENT_CAUSE], causes)]
+
+    @property
+    def breaks(self) -> Ints:
+        """Events at which the clock restarts or steps."""
+        return self.events_of(kernel.STEP, kernel.RESTART)
 
     @property
     def has_late_rows(self) -> bool:
         """Whether three consecutive rows were dropped, as happens after a pause."""
-        rows = np.sort(self.events_of(DUPLICATE, OUT_OF_ORDER)[:, EVENT_ROW])
+        rows = np.sort(self.events_of(kernel.DUPLICATE, kernel.OUT_OF_ORDER)[:, kernel.EVENT_ROW])
         rows = rows[self.samples_of(rows) < 0]
         return bool((rows[2:] - rows[:-2] == 2).any())
 
@@ -96,9 +89,9 @@ def make_placement(
 ) -> Placement:
     """Make a placement of lists of runs and events, sorted by sample."""
     table = np.concatenate(runs)
-    happened = np.concatenate([*events, np.empty((0, EVENT_COLUMNS), dtype=np.int64)])
+    happened = np.concatenate([*events, np.empty((0, kernel.EVENT_COLUMNS), dtype=np.int64)])
     table = table[np.argsort(table[:, 0], kind="stable")]
-    happened = happened[np.argsort(happened[:, EVENT_SAMPLE], kind="stable")]
+    happened = happened[np.argsort(happened[:, kernel.EVENT_SAMPLE], kind="stable")]
     return Placement(start, rate, table, happened, wander)
 
 
@@ -159,10 +152,10 @@ def place_by_stamp(stamps: Stamps, rate: float, *, max_gap: float, where: str) -
     runs: list[Ints] = []
     events: list[Ints] = []
     first = np.empty(0, dtype=np.int64)
-    for rows, values in recut_blocks(stamps, _STRETCH_ROWS, LOOK_AHEAD):
+    for rows, values in recut_blocks(stamps, _STRETCH_ROWS, kernel.LOOK_AHEAD):
         if len(first) == 0:
             first = readable_stamps(values)[:_FIRST_STAMPS]
-        n = _STRETCH_ROWS if len(rows) == _STRETCH_ROWS + LOOK_AHEAD else len(rows)
+        n = _STRETCH_ROWS if len(rows) == _STRETCH_ROWS + kernel.LOOK_AHEAD else len(rows)
         new, happened = kernel.place(rows, values, n, period, HOLD, max_gap * rate, state, ring)
         runs.append(new)
         events.append(happened)
@@ -211,7 +204,7 @@ def _make_windows(stamps: Stamps, period: float, width: int) -> tuple[_Windows, 
             if not window.size:
                 continue
             ahead = (window - zero) / period - (np.arange(window.size) + done).reshape(window.shape)
-            ahead[window == NO_STAMP] = np.nan
+            ahead[window == kernel.NO_STAMP] = np.nan
             # a row without a readable stamp has the lead of the last one before it
             leads = pd.Series(np.concatenate([last, ahead.ravel()])).ffill().bfill().fillna(0.0)
             filled = leads.to_numpy()[len(last) :].reshape(window.shape)
@@ -274,14 +267,14 @@ def place_by_count(
         stamp_before = first + int((row - 1 + level) * period)
         if size < 0 or size > max_gap * rate:
             before, after = row + level, row + level + size
-            cause = RESTART if size < 0 and is_restart(0.0, begun, before, after) else STEP
+            cause = break_cause(0.0, begun, before, after)
             stamp = stamp_before + int((size + 1) * period)
             events.append((cause, row + shifts[-1], len(cuts), stamp_before, stamp))
             extra, begun = 1, after
         shifts.append(shifts[-1] + extra)
         cuts.append(row)
     runs, cut_rows = _counted_runs(stamps, np.array(cuts), np.array(shifts))
-    numbers = np.array(events, dtype=np.int64).reshape(-1, EVENT_COLUMNS)
+    numbers = np.array(events, dtype=np.int64).reshape(-1, kernel.EVENT_COLUMNS)
     numbers[:, 2] = cut_rows[numbers[:, 2]]
     return make_placement(start, rate, runs, [numbers], wander)
 

@@ -7,12 +7,12 @@ from itertools import pairwise
 import numpy as np
 
 from gyrostab.arrays import Ints
-from gyrostab.ingest.gap_table import is_restart
+from gyrostab.ingest.gap_table import break_cause
 from gyrostab.ingest.grid.jitter import GAIN, MIN_SIGMA, TRACE_ROWS, JitterModel, observe_rows
 from gyrostab.ingest.grid.place import HOLD, Placement, append_runs, make_placement
 from gyrostab.ingest.grid.starting_period import SECOND, Stamps, recut_blocks
 from gyrostab.kernels.grid.course import find_breaks, find_phase, trace
-from gyrostab.kernels.grid.stamps import DUPLICATE, RESTART, STEP
+from gyrostab.kernels.grid.stamps import DUPLICATE
 from gyrostab.time.grid import period_ns
 
 _AHEAD_ROWS = 1 << 12
@@ -64,9 +64,8 @@ class _Placer:
                 )
 
     def _add_break(self, row: int, previous_stamp: int, stamp: int) -> None:
-        back = stamp < previous_stamp
-        is_new = back and is_restart(self.origin, self.origin, previous_stamp, stamp)
-        event = [RESTART if is_new else STEP, self.last + 1, row, previous_stamp, stamp]
+        cause = break_cause(self.origin, self.origin, previous_stamp, stamp)
+        event = [cause, self.last + 1, row, previous_stamp, stamp]
         self.events.append(np.array([event], dtype=np.int64))
 
     def _begin_piece(self, count: Ints, stamps: Ints, at: Ints) -> None:

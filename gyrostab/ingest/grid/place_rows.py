@@ -35,8 +35,6 @@ from gyrostab.kernels.grid.stamps import (
     EVENT_SAMPLE,
     EVENT_STAMP,
     NO_STAMP,
-    RESTART,
-    STEP,
 )
 from gyrostab.schema import signal_name
 from gyrostab.store.lazy import find_source, read_slice
@@ -108,7 +106,7 @@ class RowPlacer:
         try:
             estimate = estimate_rate(stamps, where=self.where)
         except TimeError:
-            if declared is None or scanned.row_count - scanned.absent_count > 1:
+            if declared is None or scanned.present_count > 1:
                 raise
             estimate = RateEstimate(
                 declared, 0.0, places_by_count=False, stamps_are_shared=False, unrounded=declared
@@ -217,12 +215,7 @@ class RowPlacer:
         placement = self._place_once(
             partial(place_by_stamp, stamps, rate, max_gap=max_gap, where=self.where)
         )
-        dropped = (
-            scanned.row_count
-            - scanned.absent_count
-            - scanned.repeated_count
-            - placement.placed_count
-        )
+        dropped = scanned.present_count - scanned.repeated_count - placement.placed_count
         has_repeats = scanned.repeated_count > repeated_before
         if not has_repeats and (dropped >= _MIN_DROPPED_ROWS or placement.has_late_rows):
             # placing in order may recover them
@@ -256,7 +249,7 @@ def find_repeats(raw: xr.Dataset, placement: Placement) -> list[Ints]:
 
     Returns a table for each repetition, (n, 3): row, the row that it repeats, and its stamp [ns].
     """
-    breaks = placement.events_of(STEP, RESTART)
+    breaks = placement.breaks
     back = breaks[breaks[:, EVENT_STAMP] < breaks[:, EVENT_BEFORE]]
     repeats: list[Ints] = []
     for row, stamp in sorted(back[:, [EVENT_ROW, EVENT_STAMP]].tolist()):

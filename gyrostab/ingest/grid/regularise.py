@@ -25,6 +25,7 @@ from gyrostab.ingest.gap_table import (
     END,
     FIRST,
     MISSING,
+    RESTART,
     SAMPLES,
     make_dataset,
     name_lost,
@@ -38,14 +39,7 @@ from gyrostab.ingest.grid.place_rows import RowPlacer
 from gyrostab.ingest.grid.scan_pass import BLOCK_ROWS, ScanPass, file_of, record_name, scan_rows
 from gyrostab.ingest.limits import check_limits
 from gyrostab.ingest.uniform import as_uniform, check_same_rate
-from gyrostab.kernels.grid.stamps import (
-    EVENT_ROW,
-    EVENT_SAMPLE,
-    EVENT_STAMP,
-    NO_STAMP,
-    RESTART,
-    STEP,
-)
+from gyrostab.kernels.grid.stamps import EVENT_ROW, EVENT_SAMPLE, EVENT_STAMP, NO_STAMP
 from gyrostab.schema import SIGNAL_UNITS, check_raw, signal_name, texts
 from gyrostab.store.lazy import read_slice
 from gyrostab.store.write import chunk_samples
@@ -74,12 +68,11 @@ _OWN_ATTRIBUTES = (
 
 def _is_on_grid(channel: Any, n_filled: int, scanned: ScanPass, placement: Placement) -> bool:
     """Whether a channel has values for most samples, and few in rows without a gyro value."""
-    present = scanned.row_count - scanned.absent_count
-    if n_filled <= 0.5 * present:
+    if n_filled <= 0.5 * scanned.present_count:
         return False
     if scanned.absent_count <= _MAX_UNPLACED_SHARE * n_filled:
         return True  # without reading the channel
-    dropped = max(0, present - placement.placed_count)  # they lose their channels too
+    dropped = max(0, scanned.present_count - placement.placed_count)  # they lose their channels too
     placed = 0
     for begin in range(0, channel.shape[0], BLOCK_ROWS):
         block = read_slice(channel, begin, min(begin + BLOCK_ROWS, channel.shape[0]))
@@ -349,7 +342,7 @@ def gather_channel(
 ) -> tuple[NDArray[np.datetime64], Floats]:
     """Return stamps and values of the filled rows of a slow channel."""
     channel = raw[name].data
-    breaks = placement.events_of(STEP, RESTART)
+    breaks = placement.breaks
     breaks = breaks[np.argsort(breaks[:, EVENT_ROW], kind="stable")]
     grid_stamps = grid_times(placement.start, placement.rate, breaks[:, EVENT_SAMPLE] + 1)
     moved = np.concatenate([[0], grid_stamps - breaks[:, EVENT_STAMP]])

@@ -41,6 +41,11 @@ class ScanPass:
     filled_counts: dict[str, int] = field(default_factory=dict)
     repeated_count: int = 0  # rows that repeat others
 
+    @property
+    def present_count(self) -> int:
+        """Number of rows with a number, including repetitions."""
+        return self.row_count - self.absent_count
+
     def leave_out(self, rows: Ints) -> None:
         """Mark rows as repetitions, which hold no new sample."""
         bits = (128 >> rows % 8).astype(np.uint8)
