@@ -239,10 +239,10 @@ def _read_all(
                 raise
             lost[path] = _reason_of(path, error)
             continue
-        held += memory_bytes(part)
-        if held > SPILL_BYTES and len(paths) > 1:
-            held -= memory_bytes(part)
-            part = move_to_disk(part, spool)
+        size = memory_bytes(part)
+        if held + size > SPILL_BYTES and len(paths) > 1:
+            part, size = move_to_disk(part, spool), 0
+        held += size
         parts[path] = part
     if len(lost) > MAX_LOST_SHARE * len(paths):
         advice = "that is more than damage: check the names and the reading options"

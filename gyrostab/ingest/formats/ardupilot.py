@@ -10,7 +10,6 @@ ArduPilot, onboard message log messages.
 
 from __future__ import annotations
 
-import re
 import threading
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
@@ -18,14 +17,13 @@ from pathlib import Path
 from typing import Any
 
 from gyrostab.errors import DamageError
-from gyrostab.ingest.formats.recognise import read_head
+from gyrostab.ingest.formats.recognise import make_matcher, read_head
 from gyrostab.ingest.formats.tables import Messages, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
 
 #: Held while the standard streams of the process are redirected.
 _LOCK = threading.Lock()
 _BINARY = b"\xa3\x95\x80"
-_TEXT = re.compile(rb"^FMT, ?128, ?89, ?FMT,", re.MULTILINE)
 _GYRO = {f"Gyr{axis.upper()}": f"gyro_{axis} [rad/s]" for axis in "xyz"}
 _ACCEL = {f"Acc{axis.upper()}": f"accel_{axis} [m/s^2]" for axis in "xyz"}
 #: Message -> field -> target in the form of ``--map``; GYR and ACC hold every sample of a sensor.
@@ -38,10 +36,8 @@ _MEANINGS = {
 }
 
 
-def matches(path: Path) -> bool:
-    """Return whether the file begins with the description of a message."""
-    head = read_head(path)
-    return head.startswith(_BINARY) or bool(_TEXT.search(head))
+#: The description of a message, binary or in a line.
+matches = make_matcher(_BINARY + rb"|(?ms:.*?^FMT, ?128, ?89, ?FMT,)")
 
 
 def _open_binary(reader: Any, path: Path) -> Any:

@@ -39,6 +39,7 @@ from gyrostab.ingest.columns.headers import (
 )
 from gyrostab.ingest.columns.plan import describe_left_out
 from gyrostab.ingest.formats.packing import ATTRIBUTES, attribute_text
+from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.formats.tables import (
     MAX_COLUMNS,
     StoredArray,
@@ -190,8 +191,7 @@ def _columns_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iter
 
 def _find_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterable[tuple[str, Any]]:
     """Find names and arrays of numbers; descriptions of MATLAB objects are added to `objects`."""
-    with path.open("rb") as file:
-        head = file.read(1024)
+    head = read_head(path)[:1024]
     if b"MATLAB 7.3" in head[:128] or b"\x89HDF" in head or path.suffix.lower() in HDF_SUFFIXES:
         return _find_hdf_arrays(path, stack, objects)
     return read_arrays(path, objects)

@@ -26,7 +26,7 @@ from gyrostab.ingest.columns.headers import AXIS_PATTERN, split_header
 from gyrostab.ingest.columns.plan import describe_left_out
 from gyrostab.ingest.columns.stamps import names_epoch
 from gyrostab.ingest.concat.grid import log_span
-from gyrostab.ingest.formats.recognise import make_matcher
+from gyrostab.ingest.formats.recognise import make_matcher, read_head
 from gyrostab.ingest.formats.tables import (
     MAX_COLUMNS,
     StoredArray,
@@ -306,9 +306,8 @@ def _check_classic_header(path: Path) -> None:
 
     The NetCDF library would allocate whatever a damaged header asks for; scipy maps the file.
     """
-    with path.open("rb") as file:
-        if file.read(4) not in (b"CDF\1", b"CDF\2"):
-            return
+    if not read_head(path).startswith((b"CDF\1", b"CDF\2")):
+        return
     from scipy.io import netcdf_file
 
     class Header(netcdf_file):

@@ -10,24 +10,19 @@ NovAtel, OEM7 commands and logs reference manual, RAWIMU, RAWIMUX, RAWIMUS and R
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from gyrostab.ingest.columns.stamps import GPS_EPOCH, GPS_NOTE, GPS_WEEK, MAX_GPS_WEEK, NAT
-from gyrostab.ingest.formats.recognise import read_head
+from gyrostab.ingest.formats.recognise import make_matcher
 from gyrostab.ingest.formats.tables import Messages, TablesOfFile, library, make_reader
 from gyrostab.ingest.options import ReadOptions
 
-_SYNC = (b"\xaa\x44\x12", b"\xaa\x44\x13")
-_TEXT = re.compile(rb"^[#%][A-Z0-9]{3,}A,[^\r\n]*;", re.MULTILINE)
 _SENSORS = ("gyro", "accel")
 _KINDS = ("RAWIMU", "RAWIMUX", "RAWIMUS", "RAWIMUSX")
 
 
-def matches(path: Path) -> bool:
-    """Return whether the file begins with a message of a NovAtel receiver."""
-    head = read_head(path)
-    return head.startswith(_SYNC) or bool(_TEXT.search(head))
+#: A message of a receiver, binary or in a line.
+matches = make_matcher(rb"\xaa\x44[\x12\x13]|(?ms:.*?^[#%][A-Z0-9]{3,}A,[^\r\n]*;)")
 
 
 def _read_messages(path: Path, options: ReadOptions) -> TablesOfFile:

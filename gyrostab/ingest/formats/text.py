@@ -26,6 +26,7 @@ from gyrostab.ingest.columns.plan import Column, Plan
 from gyrostab.ingest.columns.plan_roles import plan_columns
 from gyrostab.ingest.columns.raw_log import ConvertedBlock, RawLogBuilder, summary_of
 from gyrostab.ingest.columns.stamps import NAT, add_weeks, cells_to_ns, is_number
+from gyrostab.ingest.formats.recognise import read_head
 from gyrostab.ingest.options import FileSummary, ReadOptions
 from gyrostab.ingest.text.cells import BlockParser, ParsedBlock, decode_line, parse_numbers
 from gyrostab.ingest.text.layout import Layout, find_layout, is_text, unit_of_duration
@@ -36,6 +37,7 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log")
 #: fewer lines than the third.
 HEAD_BYTES, MAX_HEAD_BYTES, HEAD_LINES = 2**18, 2**24, 4
 BLOCK_BYTES = 2**22
+_GZIP = b"\x1f\x8b"
 COUNTED_BYTES = 2**24
 #: Time of day and fraction of a second, a fraction with leading zeros, and the number of steps back
 #: of which the fractions are compared.
@@ -56,7 +58,7 @@ def scan(path: Path, options: ReadOptions) -> FileSummary:
     head = tail = np.empty(0, np.int64)
     if time is not None:
         head = _sample_stamps(layout, plan, time, layout.samples)
-    if not _is_gzipped(path):
+    if not read_head(path).startswith(_GZIP):
         size = path.stat().st_size
         with path.open("rb") as file:
             file.seek(max(layout.offset, size - 2**14))
@@ -172,11 +174,6 @@ def _is_solid(row: list[str], layout: Layout, time: int) -> bool:
     )
 
 
-def _is_gzipped(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(2) == b"\x1f\x8b"
-
-
 def _holds_text(path: Path) -> bool:
     try:
         with _open_text(path) as file:
@@ -189,7 +186,8 @@ def _holds_text(path: Path) -> bool:
 @contextmanager
 def _open_text(path: Path) -> Iterator[IO[bytes]]:
     """Open a text file, plain or gzipped; `FormatError` where a gzip stream is damaged."""
-    with gzip.open(path, "rb") if _is_gzipped(path) else path.open("rb") as file:
+    is_packed = read_head(path).startswith(_GZIP)
+    with gzip.open(path, "rb") if is_packed else path.open("rb") as file:
         try:
             yield cast(IO[bytes], file)
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
