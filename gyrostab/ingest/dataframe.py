@@ -6,18 +6,17 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
 from gyrostab.errors import GyrostabError, MissingUnitError, SchemaError, TimeError
+from gyrostab.ingest.columns.headers import FileColumn, split_header
 from gyrostab.ingest.combine import warn_notes
+from gyrostab.ingest.options import ReadOptions
 from gyrostab.schema import texts
-
-if TYPE_CHECKING:
-    from gyrostab.ingest.options import ReadOptions
 
 #: An option of a command with its value, as messages on files advise it.
 _OPTION = re.compile(
@@ -125,7 +124,6 @@ def _read_frame(
     **given: Any,
 ) -> xr.Dataset:
     """Read a pandas table into a raw log, by the rules and with options for files."""
-    from gyrostab.ingest.columns.headers import FileColumn
     from gyrostab.ingest.columns.plan_roles import plan_columns
     from gyrostab.ingest.columns.typed import read_columns
     from gyrostab.ingest.reading import refuse_unused_options
@@ -178,9 +176,6 @@ def _make_options(
     **given: Any,
 ) -> ReadOptions:
     """Convert keywords to options for files; a unit of all axes lets x, y and z name axes."""
-    from gyrostab.ingest.columns.headers import split_header
-    from gyrostab.ingest.options import ReadOptions
-
     renamed = {str(key): name for key, name in (map or {}).items()}
     if not isinstance(units, Mapping):
         keys = {key.strip().lower() for key in renamed}
