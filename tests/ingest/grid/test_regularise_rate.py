@@ -48,6 +48,23 @@ def test_no_drift_over_200_hours(rate):
     assert abs(int(end) - exact) <= 1
 
 
+@pytest.mark.parametrize(
+    ("step", "cause"), [(-14.0, "restart"), (-5.0, "clock_step"), (20 * 86400.0, "clock_step")]
+)
+def test_a_step_of_the_clock_between_bursts_is_one_missing_sample(step, cause):
+    n, random = 3000, np.random.default_rng(1)
+    begins = np.append(0, np.cumsum(random.integers(2, 40, n)))  # first row of each packet
+    begins = begins[begins < n]
+    packet = np.searchsorted(begins, np.arange(n), side="right") - 1
+    sent = np.append(begins[1:], n)[packet] / 100.0 + random.uniform(0, 0.15, n)[packet]
+    arrival = sent + (np.arange(n) - begins[packet]) * random.uniform(5e-5, 3e-4, n)[packet]
+    arrival[n // 2 :] += step
+    log = regularise(raw_log(START + np.rint(arrival * 1e9).astype(np.int64)))
+    assert any("placed by their count" in note for note in log.attrs["notes"])
+    assert gap_table(log)[["samples", "cause"]].values.tolist() == [[1, cause]]
+    assert np.isfinite(log.rate.values).sum() == n
+
+
 def test_bursts_are_placed_by_count_and_a_loss_shows_as_a_lasting_delay():
     random = np.random.default_rng(4)
     n, lost = 20_000, 450
