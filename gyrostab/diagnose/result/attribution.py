@@ -306,7 +306,7 @@ def _with_shared_lines(
     lines = [
         (component.line_index, component.row[0])
         for component in components_of(identified)
-        if component.statistic.is_line and component.line_index >= 0
+        if component.statistic.is_line
     ]
     if len(lines) < 2:
         return after

@@ -367,7 +367,7 @@ def unidentified_mismatches(
             if nearest
             else "no known effect explains it"
         )
-        description = NUISANCE_ALTERNATIVES.get(unidentified.effect, "something differs")
+        description = NUISANCE_ALTERNATIVES[unidentified.effect]
         begin, end, when = _find_event(unidentified, blocks)
         text = (
             f"On {axes_text(unidentified.axes)} {description}{when}; {explanation} "

@@ -184,7 +184,7 @@ def _slow_allan_variance(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -
 
     In degree2 hour-2. Angle noise has the law of quantization.
     """
-    coefficient = baseline["coefficient"].values
+    coefficient = baseline["coefficient"]
     processes = (expected_processes(baseline, row) for row in range(blocks.sizes["axis"]))
     total = np.array(
         [
@@ -192,10 +192,9 @@ def _slow_allan_variance(blocks: xr.Dataset, baseline: xr.Dataset, tau: float) -
             for part in processes
         ]
     )
-    for place, term in enumerate(baseline["term"].values):
-        if str(term) in ("B", "K"):
-            total = total + LAWS[str(term)].avar(tau) * np.nan_to_num(coefficient[..., place]) ** 2
-    return np.asarray(total)
+    for term in ("B", "K"):
+        total += LAWS[term].avar(tau) * coefficient.sel(term=term).values ** 2
+    return total
 
 
 def _gamma_shape(count: Any, k: int) -> Floats:

@@ -50,8 +50,8 @@ def effect_candidates(
     >>> from gyrostab.ingest.make_log import make_log
     >>> noise = 1.8 * np.random.default_rng(1).standard_normal((1, 60_000))
     >>> blocks = reduce_log(make_log(noise, rate=100.0, unit="deg/h"))
-    >>> coordinates = {"axis": ["axis_0"], "term": ["N", "B"]}
-    >>> level = xr.DataArray([[0.003, 0.0]], coordinates, ("axis", "term"))
+    >>> coordinates = {"axis": ["axis_0"], "term": list("QNBKR")}
+    >>> level = xr.DataArray([[0.0, 0.003, 0.0, 0.0, 0.0]], coordinates, ("axis", "term"))
     >>> candidates, reasons = effect_candidates(blocks, level)
     >>> reasons["shupe"]
     'not identifiable: the recording has no channel temperature'

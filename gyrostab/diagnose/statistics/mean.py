@@ -293,10 +293,9 @@ def _matched_filter(
 
 
 def slow_coefficients(baseline: xr.Dataset, axis: int) -> tuple[float, float]:
-    """Return B and K of the means of an axis, 0 where the baseline has none."""
-    terms = [str(term) for term in baseline["term"].values]
-    B, K = baseline["coefficient"].values[axis, [terms.index(term) for term in ("B", "K")]]
-    return float(np.nan_to_num(B)), float(np.nan_to_num(K))
+    """Return B and K of the means of an axis."""
+    B, K = baseline["coefficient"].isel(axis=axis).sel(term=["B", "K"]).values.tolist()
+    return B, K
 
 
 def mean_noise(blocks: xr.Dataset, baseline: xr.Dataset, axis: int, series: Floats) -> MeanNoise:

@@ -105,11 +105,7 @@ class Power(Statistic):
         rate = float(prospect.blocks.attrs["sampling_rate_hz"])
         level: dict[str, Floats] = {}
         for (symbol, name), share in prospect.prediction.level.items():
-            square = (
-                prospect.coefficient.sel(term=symbol).values ** 2
-                if symbol in prospect.coefficient["term"].values
-                else np.zeros(prospect.coefficient.sizes["axis"])
-            )
+            square = prospect.coefficient.sel(term=symbol).values ** 2
             component = (
                 np.atleast_2d(share)[..., None]
                 * square[:, None, None]
@@ -199,11 +195,9 @@ def _filter_change(
 ) -> Floats:
     """Return the change of the baseline spectrum by a response."""
     total = np.zeros((coefficient.sizes["axis"], 1, frequency.size))
-    size, terms = coefficient.values, list(coefficient["term"].values)
-    for symbol in (symbol for symbol in "QNBK" if symbol in terms):
-        total += size[:, terms.index(symbol), None, None] ** 2 * sampled_psd(
-            symbol, frequency, rate
-        )
+    for symbol in "QNBK":
+        square = coefficient.sel(term=symbol).values[:, None, None] ** 2
+        total += square * sampled_psd(symbol, frequency, rate)
     return total * (response - 1.0)
 
 

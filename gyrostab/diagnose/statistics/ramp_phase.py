@@ -128,8 +128,7 @@ class RampPhase(Statistic):
 
     def condition(self, state: State, component: Component) -> State:
         state = state.with_columns("phase_locked", component.row[0], list(component.variant.design))
-        if "ramp_turns" in state.blocks:
-            state = state.with_columns("line", component.row[0], [_ramp_lines(state)])
+        state = state.with_columns("line", component.row[0], [_ramp_lines(state)])
         return free_shape(state, component.row[0])
 
     def noise_shares(

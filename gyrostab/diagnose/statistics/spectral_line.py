@@ -131,7 +131,7 @@ class SpectralLineStatistic(Statistic):
         power = power if power.ndim == 4 else power[None]
         expected = expected_lines(trial.state.baseline, trial.state.blocks["line_frequency"].values)
         evidence_nats = line_evidence(power, trial.state.blocks["line_weight"].values, expected)
-        if "record" not in trial.data["line_power"].dims and "sine_nats" in trial.data:
+        if not trial.is_null:
             evidence_nats = np.logaddexp(evidence_nats, trial.data["sine_nats"].values) - np.log(2)
         evidence_nats = np.where(explained_lines(trial.state), -np.inf, evidence_nats)
         # (record,), one line for all axes
@@ -169,7 +169,7 @@ class SpectralLineStatistic(Statistic):
         The power of the bands of a resonance is free: its slopes are not known.
         """
         blocks, place = state.blocks, component.line_index
-        if place < 0 or math.isfinite(line_quality(blocks, state.baseline, axis, place)):
+        if math.isfinite(line_quality(blocks, state.baseline, axis, place)):
             return super().noise_shares(component, axis, state, expected_power)
         total, _ = mean_line_power(blocks, axis)
         skirt = line_skirt(blocks, axis, place, state.settings)
@@ -185,8 +185,7 @@ class SpectralLineStatistic(Statistic):
 
         The powers of bands show little of it, and slow noise is fitted to that of a slow one.
         """
-        axis_blocks, place = blocks.sel(axis=component.row[0]), component.line_index
-        return place >= 0 and _has_constant_phase(axis_blocks, place)
+        return _has_constant_phase(blocks.sel(axis=component.row[0]), component.line_index)
 
     def estimate(self, fit: SizeFit) -> Sizes:
         """Estimate amplitudes and the frequency, from the power about the line.
@@ -219,7 +218,7 @@ class SpectralLineStatistic(Statistic):
             return False
         if region["view"] == "cross_axis":
             return region["quantity"] != "slow"
-        if component.line_index < 0 or region["view"] == "distribution":
+        if region["view"] == "distribution":
             return True
         lines = blocks["line_frequency"].values
         mine = float(lines[component.line_index])
@@ -237,8 +236,6 @@ class SpectralLineStatistic(Statistic):
 
     def averaging_times(self, component: Component, blocks: xr.Dataset) -> tuple[float, float]:
         """Return the averaging time at which the Allan variance of the line is largest."""
-        if component.line_index < 0:
-            return super().averaging_times(component, blocks)
         tau = SINE_TAU_CYCLES / float(blocks["line_frequency"].values[component.line_index])
         return tau, tau
 
@@ -323,8 +320,6 @@ def estimate_line(
 
 def _has_constant_phase(axis_blocks: xr.Dataset, place: int) -> bool:
     """Return whether a sine of constant phase has more evidence than a line of this axis."""
-    if "sine_nats" not in axis_blocks:
-        return False
     power, weight = (axis_blocks[name].values for name in ("line_power", "line_weight"))
     evidence = line_evidence(power[None, None], weight[None])[0, 0, place]
     return bool(axis_blocks["sine_nats"].values[place] > evidence)
