@@ -194,15 +194,16 @@ def form_error(
     error = 0.0
     for selection in chosen:
         for component in selection.components:
+            statistic = component.statistic
             affected_candidates = [
                 own.candidate
                 for own in components
                 if not own.statistic.is_line
-                and own.statistic.error_shows_in[0] in component.statistic.error_shows_in
+                and own.statistic.name in (statistic.name, *statistic.error_shows_in)
                 and {*own.row} & {*component.row}
             ]
             is_spectral = (
-                component.statistic.is_power
+                statistic.is_power
                 and bool(selection.driver)
                 and any(
                     candidate.effect == _FILTER or candidate.driver == selection.driver

@@ -110,7 +110,8 @@ class Statistic:
     #: Nuisance alternative as which an effect is reported on the axes where it shows in this
     #: statistic and its size may be zero (`gyrostab.diagnose.result.finish.keep_supported`).
     unsupported_as = "~S(f)"
-    error_shows_in: tuple[str, ...] = ()  # statistics that show an error of the form of an effect
+    #: Other statistics that show an error of the form of an effect.
+    error_shows_in: tuple[str, ...] = ()
     #: Variable of the null records that the evidence uses; "" to draw noise of the linear model.
     null_variable = ""
     # what an effect does

@@ -62,7 +62,6 @@ class CrossSpectrum(Statistic):
     containing_views = ("davar", "cross_axis")
     modelled_views = explained_views
     unsupported_as = "~cov"
-    error_shows_in = ("cross_spectrum",)
     null_variable = "cross"
     is_power_weighted = True
     is_pairwise = True

@@ -83,7 +83,6 @@ class BlockMeanStatistic(Statistic):
     containing_views: tuple[str, ...] = ("davar", "mean", "restart", "cross_axis")
     modelled_views = explained_views
     unsupported_as = "~bias(t)"
-    error_shows_in = ("mean",)
 
     def condition(self, state: State, component: Component) -> State:
         """Put columns into the means, and mask blocks in which the effect moves much."""
@@ -113,6 +112,7 @@ class Mean(BlockMeanStatistic):
     """Block means, which the Allan variance does not show."""
 
     name = "mean"
+    error_shows_in = ("telegraph",)
     null_variable = "mean"
     is_in_means = True
     is_linear_in_means = True

@@ -57,7 +57,6 @@ class Power(Statistic):
     containing_views = ("davar", "distribution")
     modelled_views = explained_views
     unsupported_as = "~N(t)"
-    error_shows_in = ("power",)
     null_variable = "power"
     is_power_weighted = True
     is_power = True

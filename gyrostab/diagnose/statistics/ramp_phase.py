@@ -45,7 +45,6 @@ class RampPhase(Statistic):
     view = "spectrum"
     explained_views = ("spectrum", "davar", "distribution", "mean")
     containing_views = ("davar",)
-    error_shows_in = ("ramp_phase",)
     is_power_weighted = True
     is_phase_locked = True
 

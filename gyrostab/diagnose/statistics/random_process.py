@@ -49,7 +49,6 @@ class RandomProcess(BlockMeanStatistic):
     containing_views = ()
     unsupported_as = "~red"
     null_variable = "mean"
-    error_shows_in = ("random_process",)
     has_course = True
     has_size = False
     takes_noise = False

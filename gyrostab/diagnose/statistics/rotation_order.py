@@ -42,7 +42,7 @@ class RotationOrder(Statistic):
     view = "spectrum"
     explained_views = ("spectrum", "davar", "mean", "distribution", "cross_axis")
     containing_views = ("davar",)
-    error_shows_in = ("rotation_order", "power", "cross_spectrum")
+    error_shows_in = ("power", "cross_spectrum")
     is_power_weighted = True
     is_phase_locked = True
     is_rotation = True

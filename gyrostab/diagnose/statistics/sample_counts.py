@@ -82,7 +82,6 @@ class SampleCounts(Statistic):
     containing_views = ("davar", "mean", "restart", "cross_axis")
     modelled_views = ("cross_axis",)  # anomalous blocks are left out there
     unsupported_as = "~outliers"
-    error_shows_in = ("sample_counts",)
     is_count = True
     has_size = False
     takes_noise = False

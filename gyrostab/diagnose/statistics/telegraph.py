@@ -47,6 +47,7 @@ class TelegraphStatistic(BlockMeanStatistic):
     """A bias that switches between two levels, in block means or within blocks."""
 
     name = "telegraph"
+    error_shows_in = ("mean",)
     is_in_means = True
     is_switching = True
     is_random_bias = True

@@ -39,7 +39,6 @@ class Transfer(Statistic):
     view = "davar"
     explained_views = ("davar", "cross_axis", "spectrum", "mean", "distribution")
     containing_views = ("davar",)
-    error_shows_in = ("transfer",)
     is_power_weighted = True
     is_transfer = True
 

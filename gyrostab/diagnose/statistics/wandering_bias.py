@@ -47,7 +47,6 @@ class WanderingBias(RandomProcess):
     """
 
     name = "wandering_bias"
-    error_shows_in = ("wandering_bias",)
     is_random_bias = True
     is_tried_last = True  # it resembles any slow course
 
