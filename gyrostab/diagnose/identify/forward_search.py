@@ -16,7 +16,7 @@ from gyrostab.diagnose.identify.components import (
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import keep_physical, passes_time_shift_test
 from gyrostab.diagnose.identify.identifications import Identifications
-from gyrostab.diagnose.identify.naming_order import find_pair, order_passing, order_rivals
+from gyrostab.diagnose.identify.naming_order import SearchRound
 from gyrostab.diagnose.identify.selections import (
     Selection,
     add_selection,
@@ -25,12 +25,7 @@ from gyrostab.diagnose.identify.selections import (
 )
 from gyrostab.diagnose.identify.settling import prune_selections, settle_selections
 from gyrostab.diagnose.identify.withdrawal import withdraw_effects, without_pulses
-from gyrostab.diagnose.predict.candidates import (
-    Candidate,
-    CandidateEvidence,
-    Component,
-    is_nuisance,
-)
+from gyrostab.diagnose.predict.candidates import CandidateEvidence, Component, is_nuisance
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.search import combine_rows
@@ -154,27 +149,18 @@ def score_candidates(
         and (includes_last_resorts or not candidate.statistic.is_tried_last)
     ]
     all_evidence = examination.compute_evidence(sought, state)
-    weighted = [
-        evidence.candidate
-        for evidence in all_evidence
-        if evidence.candidate.statistic.is_power_weighted
-    ]
+    weighted = [candidate for candidate in sought if candidate.statistic.is_power_weighted]
+    others = [item for item in all_evidence if not item.candidate.statistic.is_power_weighted]
     settings = examination.settings
     min_nats = settings.reweight_thresholds * examination.threshold
     for _ in range(2):
-        powers = [evidence for evidence in all_evidence if evidence.candidate.statistic.is_power]
+        powers = [item for item in all_evidence if item.candidate.statistic.is_power]
         strongest = max(powers, key=_sum_rows, default=None)
         if strongest is None or _sum_rows(strongest) < min_nats:
             break
         trial = condition_on(state, select_components(strongest, settings))
-        weighted_evidence = examination.compute_evidence(
-            weighted, replace(state, expected_power=trial.expected_power)
-        )
-        all_evidence = [
-            evidence
-            for evidence in all_evidence
-            if not evidence.candidate.statistic.is_power_weighted
-        ] + weighted_evidence
+        weighted_state = replace(state, expected_power=trial.expected_power)
+        all_evidence = others + examination.compute_evidence(weighted, weighted_state)
     return all_evidence
 
 
@@ -191,79 +177,68 @@ def _select_next(
     time-shifted channel explains more than each effect that fails this test. If all effects that
     pass otherwise fail it, or none passes, the list of selections is empty.
     """
-    settings = examination.settings
-    components = merge_lines(group_components(all_evidence, settings=settings))
-    required = {
-        key: examination.required_nats(effect_components, chosen)
-        for key, effect_components in components.items()
-    }
-    _leave_out_impossible(components, required, examination, state, chosen, beaten)
-    passing = order_passing(components, required, state, examination)
+    search = _begin_round(examination, all_evidence, state, chosen, beaten)
+    components, required = search.components, search.required
+    passing = search.order_passing()
     if not passing:
         return [], {}
-    rivals = order_rivals(passing, components, state, examination)
-    options = [[(key, components[key], state)] for key in rivals]
-    if not rivals:
-        options = [find_pair(examination, passing, components, required, state)]
+    rivals = search.order_rivals(passing)
+    options = [[(key, components[key], state)] for key in rivals] or [search.find_pair(passing)]
     failed: dict[str, tuple[str, float]] = {}
     for option in filter(None, options):
         shifted = {
-            key: beaten_by
-            for key, effect_components, with_other in option
-            if (beaten_by := _find_shifted(effect_components, with_other))
+            key: ("a time-shifted channel", nats)
+            for key, own, with_other in option
+            for passed, _, nats in [passes_time_shift_test(own, with_other)]
+            if not passed
         }
+        failed |= shifted
         if shifted:
-            failed |= shifted
             continue
         best = option[0][1]
-        min_nats = ambiguous_evidence(best, sum_evidence(best), settings=settings)
+        min_nats = ambiguous_evidence(best, sum_evidence(best), settings=examination.settings)
         close = [
             components[other][0].candidate.effect
             for other in rivals
-            if other not in failed and sum_evidence(components[other]) >= min_nats
+            if other not in failed and search.nats(other) >= min_nats
         ]
         return [
-            make_selection(effect_components, required[key], alternatives=close)
-            for key, effect_components, _ in option
+            make_selection(own, required[key], alternatives=close) for key, own, _ in option
         ], failed
     if failed:
         return [], failed
+    effects = [components[key][0].candidate.effect for key in passing if not is_nuisance(key)]
     alternative = passing[0]
-    effects = [key for key in passing if not is_nuisance(key)]
-    nearest = [components[key][0].candidate.effect for key in effects[:3]]
     return [
-        make_selection(components[alternative], required[alternative], alternatives=nearest)
+        make_selection(components[alternative], required[alternative], alternatives=effects[:3])
     ], {}
 
 
-def _leave_out_impossible(
-    components: dict[str, list[Component]],
-    required: dict[str, float],
+def _begin_round(
     examination: Examination,
+    all_evidence: list[CandidateEvidence],
     state: State,
     chosen: Sequence[Selection],
     beaten: dict[str, tuple[str, float]],
-) -> None:
-    """Leave out the axes on which an effect would have an impossible size, where it would pass.
+) -> SearchRound:
+    """Collect what each candidate explains, without axes on which its size would be impossible.
 
-    `components` and `required` are changed; effects that another form beats are added to `beaten`.
+    Only effects that would pass are tested. Those that another form beats are added to `beaten`.
     """
-    for key, effect_components in list(components.items()):
-        if not is_nuisance(key) and sum_evidence(effect_components) > required[key]:
-            components[key], better_form = keep_physical(
-                effect_components, state, error=required[key] - examination.threshold
-            )
-            if better_form:
-                beaten[key] = better_form
-            else:
-                beaten.pop(key, None)
-                required[key] = examination.required_nats(components[key], chosen)
-
-
-def _find_shifted(components: Sequence[Component], state: State) -> tuple[str, float] | None:
-    """Return the time-shifted channel that beats an effect, and by how much [nats]."""
-    passed, _, nats = passes_time_shift_test(components, state)
-    return None if passed else ("a time-shifted channel", nats)
+    components = merge_lines(group_components(all_evidence, settings=examination.settings))
+    required = {}
+    for key, own in components.items():
+        required[key] = examination.required_nats(own, chosen)
+        if is_nuisance(key) or sum_evidence(own) <= required[key]:
+            continue
+        error = required[key] - examination.threshold
+        components[key], better_form = keep_physical(own, state, error=error)
+        if better_form:
+            beaten[key] = better_form
+        else:
+            beaten.pop(key, None)
+            required[key] = examination.required_nats(components[key], chosen)
+    return SearchRound(examination, state, components, required)
 
 
 def _sum_rows(evidence: CandidateEvidence) -> float:
@@ -297,17 +272,14 @@ def identify_expected_effects(examination: Examination) -> Examination:
     return replace(examination, expected=tuple(identified), start=state)
 
 
-def _is_candidate_of(candidate: Candidate, effect: Effect) -> bool:
-    """Return whether a candidate is this effect with its channels, or its single event."""
-    named = {*filter(None, candidate.driver)}
-    names = (effect.name, *effect.look_alikes("single event"))
-    return candidate.effect in names and named <= {*effect.channel_names().values()}
-
-
 def _best_components(effect: Effect, examination: Examination, state: State) -> list[Component]:
-    """Return the components of an effect with the most evidence on its axes."""
+    """Return the components of an effect, or its single event, with the most evidence."""
+    names = (effect.name, *effect.look_alikes("single event"))
+    channels = {"", *effect.channel_names().values()}
     candidates = [
-        candidate for candidate in examination.candidates if _is_candidate_of(candidate, effect)
+        candidate
+        for candidate in examination.candidates
+        if candidate.effect in names and channels.issuperset(candidate.driver)
     ]
     components_on_axes = [
         [

@@ -18,10 +18,7 @@ from gyrostab.diagnose.evidence.telegraph import (
 )
 from gyrostab.diagnose.identify.identifiability import keep_physical
 from gyrostab.diagnose.identify.identifications import Identifications
-from gyrostab.diagnose.identify.naming_order import (
-    drop_switching_with_a_cause,
-    identify_switching,
-)
+from gyrostab.diagnose.identify.naming_order import SearchRound
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -269,11 +266,10 @@ def test_an_effect_of_a_switching_channel_comes_first(
         FOLLOWS[0]: [led(channel, evidence_nats, axis)],
         "bias_jump": [jump(50, 20.0)],
     }
-    assert drop_switching_with_a_cause(HOPS_FIRST, components, state) == expected
-    assert drop_switching_with_a_cause(["telegraph", "bias_jump"], components, state) == [
-        "telegraph",
-        "bias_jump",
-    ]
+    search = SearchRound(None, state, components, {})
+    assert search.drop_switching_with_a_cause(HOPS_FIRST) == expected
+    without_channel = ["telegraph", "bias_jump"]
+    assert search.drop_switching_with_a_cause(without_channel) == without_channel
 
 
 @pytest.mark.parametrize(
@@ -293,8 +289,10 @@ def test_switching_within_blocks_waits_for_an_effect_that_explains_more(
         "~levels": [within],
         "bias_jump": [replace(jump(50, evidence_nats), row=(axis,))],
     }
-    assert identify_switching(list(components), components, state) == expected
-    assert identify_switching(["telegraph"], {"telegraph": [whole]}, state) == []
+    search = SearchRound(None, state, components, {})
+    assert search.identify_switching(list(components)) == expected
+    search = SearchRound(None, state, {"telegraph": [whole]}, {})
+    assert search.identify_switching(["telegraph"]) == []
 
 
 def switched(stays: Sequence[int], seed: int, *, step: float, scatter: float) -> Identifications:

@@ -12,7 +12,7 @@ import xarray as xr
 from gyrostab.diagnose.baseline.calibrate import calibrate_noise
 from gyrostab.diagnose.core import diagnose
 from gyrostab.diagnose.identify.components import sum_evidence
-from gyrostab.diagnose.identify.naming_order import order_rivals
+from gyrostab.diagnose.identify.naming_order import SearchRound
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
@@ -58,9 +58,10 @@ def test_a_steady_walk_that_explains_more_is_not_that_of_vibration():
         )
     }
     examination = SimpleNamespace(settings=DEFAULTS, candidates=[])
-    assert order_rivals(list(components), components, None, examination) == ["temperature_bias"]
+    search = SearchRound(examination, None, components, {})
+    assert search.order_rivals(list(components)) == ["temperature_bias"]
     components["~red"] = [replace(components["~red"][0], evidence_nats=997.0)]
-    assert order_rivals(list(components), components, None, examination) == [
+    assert search.order_rivals(list(components)) == [
         "vibration_random_walk",
         "temperature_bias",
     ]
