@@ -55,20 +55,15 @@ def _share_choices(components: Sequence[Component], state: State) -> list[Compon
                 tried.append(variant.texts)
     if len(tried) < 2:
         return [*components]
+    parameters = effects()[components[0].candidate.effect].parameters()
+    defaults = {item.name: item.default for item in parameters}.items()
     choices: list[tuple[float, bool, list[Component]]] = []
-    defaults = {
-        item.name: item.default for item in effects()[components[0].candidate.effect].parameters()
-    }
     for texts in tried:
         selected = [_select_texts(component, state, texts) for component in components]
         matching = [component for component in selected if component is not None]
         if len(matching) == len(components):
-            nats = sum(
-                _explained_nats(component, state, component.variant)
-                for component in matching
-                if _has_forms(component)
-            )
-            choices.append((nats, all(defaults[name] == texts[name] for name in texts), matching))
+            nats = sum(_explained_nats(part, state) for part in matching if _has_forms(part))
+            choices.append((nats, texts.items() <= defaults, matching))
     least = max((nats for nats, _, _ in choices), default=0.0) - state.settings.ambiguous_nats
     usual = [choice for choice in choices if choice[1] and choice[0] > least]
     best = max(usual or choices, key=lambda choice: choice[0], default=None)
@@ -80,12 +75,8 @@ def _select_texts(component: Component, state: State, texts: Mapping[str, str]) 
     if component.variant.texts == texts or not _has_forms(component):
         return component
     variants = component.candidate.family(replace(component.variant, values=texts))
-    if not variants:
-        return None
-    return replace(
-        component,
-        variant=max(variants, key=lambda variant: _explained_nats(component, state, variant)),
-    )
+    best = _best_variant(component, state, variants)
+    return None if best is None else replace(component, variant=best)
 
 
 def _choose_variant(component: Component, state: State) -> Component:
@@ -132,7 +123,7 @@ def prefer_plainer(component: Component, state: State) -> Component:
     }
     if is_single:  # rounding or chance may have put another term ahead
         own = component.variant.columns[0]
-        own_nats = _explained_nats(component, state, component.variant)
+        own_nats = _explained_nats(component, state)
         needed_nats = own_nats - settings.ambiguous_nats - settings.form_error_share * own_nats
         close = [name for name in terms if name == own or term_nats[name] > needed_nats]
         if len(close) < 2:
@@ -155,8 +146,9 @@ def prefer_plainer(component: Component, state: State) -> Component:
     return replace(component, variant=terms[name], note=_describe_unseparated(name, other_names))
 
 
-def _explained_nats(component: Component, state: State, variant: Variant) -> float:
+def _explained_nats(component: Component, state: State, variant: Variant | None = None) -> float:
     """Return what the terms of a variant explain [nats]; zero where they would reduce the power."""
+    variant = variant or component.variant
     size, spread = component_mixture(component, state, variant).moments()
     if variant.squared and not component.statistic.is_pairwise:
         size = np.maximum(size, 0.0)
@@ -183,6 +175,13 @@ def _single_term_variant(component: Component, state: State, name: str) -> Varia
             Point(variant, component_mixture(component, state, variant)) for variant in variants
         ]
         variants = [point.variant for point in refine_grid(component, state, grid)]
+    return _best_variant(component, state, variants)
+
+
+def _best_variant(
+    component: Component, state: State, variants: Sequence[Variant]
+) -> Variant | None:
+    """Return the variant that explains most; None without any."""
     return max(
         variants, key=lambda variant: _explained_nats(component, state, variant), default=None
     )

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, pairwise
+
+import numpy as np
 
 from gyrostab.diagnose.identify.components import (
     PLAIN_LINE,
@@ -59,23 +61,20 @@ def settle_selections(
 
     Returns what is unidentified, and the finished identifications.
     """
+    unidentified = [selection for selection in chosen if not selection.is_named]
     while True:
-        identified = {
-            place: _finish_identification(examination, selection, chosen)
-            for place, selection in enumerate(chosen)
-            if selection.is_named
-        }
-        margin = {}
-        for place, identification in identified.items():
-            others = [other for other in identified.values() if other is not identification]
+        named = [selection for selection in chosen if selection.is_named]
+        identified = [_finish_identification(examination, item, chosen) for item in named]
+        margins = []
+        for identification in identified:
+            others = [other for other in identified if other is not identification]
             required = examination.required_nats(identification.components, others)
             # whatever was named first
-            margin[place] = identification.evidence_nats - max(identification.threshold, required)
-        weakest = min(margin, key=lambda place: margin[place], default=None)
-        if weakest is None or margin[weakest] >= 0.0:
-            unidentified = [selection for selection in chosen if not selection.is_named]
-            return unidentified, list(identified.values())
-        chosen = [*chosen[:weakest], *chosen[weakest + 1 :]]
+            margins.append(identification.evidence_nats - max(identification.threshold, required))
+        if min(margins, default=0.0) >= 0.0:
+            return unidentified, identified
+        weakest = named[int(np.argmin(margins))]
+        chosen = [selection for selection in chosen if selection is not weakest]
 
 
 def _finish_identification(
@@ -89,17 +88,17 @@ def _finish_identification(
         examination, identification.components, on_axes.get(key, []), weighted
     )
     evidence_nats = sum(max(sum_evidence(layer), 0.0) for layer in layers)
+    instead = sum_by_key(on_axes)
     min_nats = ambiguous_evidence(
         identification.components, evidence_nats, settings=examination.settings
     )
     rivals = [
-        components[0].candidate.effect
-        for other, components in on_axes.items()
-        if components
-        and other != key
+        on_axes[other][0].candidate.effect
+        for other, nats in instead.items()
+        if other != key
         and not is_nuisance(other)
-        and sum_evidence(components) >= min_nats
-        and sum_evidence(keep_physical(components, state)[0]) >= min_nats
+        and nats >= min_nats
+        and sum_evidence(keep_physical(on_axes[other], state)[0]) >= min_nats
     ]
     lines = {
         component.line_index
@@ -107,11 +106,8 @@ def _finish_identification(
         if component.candidate.effect == PLAIN_LINE
     }
     rivals += find_equivalent_effects(identification.components, state, lines=len(lines))
-    spectral_alternatives = find_spectral_alternatives(
-        [component for layer in layers for component in layer], weighted, examination
-    )
-    rivals += spectral_alternatives
-    alternatives = dict.fromkeys([*identification.alternatives, *rivals])
+    spectral_alternatives = find_spectral_alternatives([*chain(*layers)], weighted, examination)
+    alternatives = dict.fromkeys([*identification.alternatives, *rivals, *spectral_alternatives])
     alternatives.pop(identification.effect, None)
     components = tuple(
         renew_component(component, layer_components)
@@ -126,7 +122,7 @@ def _finish_identification(
         alternatives=tuple(alternatives),
         components=components,
         # as probable as this effect, whatever their own form explains
-        instead=sum_by_key(on_axes) | dict.fromkeys(spectral_alternatives, evidence_nats),
+        instead=instead | dict.fromkeys(spectral_alternatives, evidence_nats),
     )
 
 

@@ -40,17 +40,13 @@ def without_pulses(chosen: Sequence[Selection], settings: Settings) -> list[Sele
         has_profile = component.statistic.is_phase_locked and not component.statistic.is_rotation
         weight = settings.min_comb_lines if has_profile else int(component.statistic.is_line)
         lines.update(dict.fromkeys(component.row, weight))
+    pulsed = {axis for axis, count in lines.items() if count >= settings.min_comb_lines}
     out: list[Selection] = []
     for selection in chosen:
-        if selection.effect != "spikes":
+        remaining = [part for part in selection.components if not pulsed & {*part.row}]
+        if selection.effect != "spikes" or len(remaining) == len(selection.components):
             out.append(selection)
-            continue
-        remaining = [
-            component
-            for component in selection.components
-            if lines[component.row[0]] < settings.min_comb_lines
-        ]
-        if remaining:
+        elif remaining:
             out.append(reduce_selection(selection, remaining))
     return out
 
@@ -60,54 +56,38 @@ def withdraw_effects(
 ) -> tuple[list[Selection], list[Selection]]:
     """Withdraw parts of unidentified drifts, and noise levels that leave another course in time.
 
-    The second result is what is unidentified instead.
+    An effect is withdrawn from an axis if it explains too little there for what it leaves. The
+    second result is what is unidentified instead.
     """
-    axes = examination.start.axes
+    settings, threshold = examination.settings, examination.threshold
     remaining = list(identified)
-    for axis in axes:
-        remaining = _without_part_of_drift(remaining, unidentified, axis, examination.threshold)
+    for axis in examination.start.axes:
+        remaining = _without_part_of_drift(remaining, unidentified, axis, threshold)
     withdrawn: list[Selection] = []
-    for axis in axes:
-        on_axis = [
-            identification
+    for axis in examination.start.axes:
+        strengths = {
+            identification: _evidence_on(identification, axis)
             for identification in remaining
             if any(
                 component.statistic.is_power and component.row == (axis,)
                 for component in identification.components
             )
-        ]
-        if not on_axis:
+        }
+        if not strengths:
             continue
         excess_nats = measure_fluctuation(examination.state_with([*remaining, *unidentified]), axis)
-        weak = _find_weak(examination, on_axis, axis, excess_nats)
+        allowed = settings.component_nats + settings.form_error_share * sum(strengths.values())
+        share = settings.spectrum_error_share
+        weak = [
+            identification
+            for identification, strength in strengths.items()
+            if excess_nats > max(allowed, share * strength)
+        ]
         if weak:
-            remaining = [
-                reduced
-                for identification in remaining
-                for reduced in (
-                    _without_axis(identification, axis, examination.threshold)
-                    if identification in weak
-                    else [identification]
-                )
-            ]
+            remaining = _without_axis(remaining, weak, axis, threshold)
             reduced_state = examination.state_with([*remaining, *unidentified])
             withdrawn += _find_fluctuation(examination, reduced_state, axis, weak)
     return remaining, withdrawn
-
-
-def _find_weak(
-    examination: Examination, identified: Sequence[Selection], axis: str, excess_nats: float
-) -> list[Selection]:
-    """Return the effects that explain too little on an axis for what they leave there [nats]."""
-    settings = examination.settings
-    strength = sum(_evidence_on(identification, axis) for identification in identified)
-    allowed = settings.component_nats + settings.form_error_share * strength
-    share = settings.spectrum_error_share
-    return [
-        identification
-        for identification in identified
-        if excess_nats > max(allowed, share * _evidence_on(identification, axis))
-    ]
 
 
 def _find_fluctuation(
@@ -120,9 +100,9 @@ def _find_fluctuation(
         for component in examination.find_components(free, state).get("~N(t)", [])
         if component.row == (axis,) and component.evidence_nats > examination.threshold
     ]
-    names = [identification.effect for identification in weak]
     if not components:
         return []
+    names = [identification.effect for identification in weak]
     return [make_selection(components, examination.threshold, alternatives=names)]
 
 
@@ -134,28 +114,36 @@ def _without_part_of_drift(
     An effect without a channel that explains less there may be a piece of the drift. It stays on
     other axes where it reaches the threshold.
     """
-    drifts = [selection for selection in unidentified if selection.effect in _DRIFTS]
-    drift_nats = sum(_evidence_on(selection, axis) for selection in drifts)
-    remaining = []
-    for identification in identified:
-        is_part = not any(identification.driver) and any(
+    drift_nats = sum(
+        _evidence_on(selection, axis) for selection in unidentified if selection.effect in _DRIFTS
+    )
+    parts = [
+        identification
+        for identification in identified
+        if not any(identification.driver)
+        and _evidence_on(identification, axis) < drift_nats
+        and any(
             component.statistic.is_linear_in_means and component.row == (axis,)
             for component in identification.components
         )
-        if not is_part or _evidence_on(identification, axis) >= drift_nats:
-            remaining.append(identification)
-        else:
-            remaining += _without_axis(identification, axis, threshold)
-    return remaining
+    ]
+    return _without_axis(identified, parts, axis, threshold)
 
 
-def _without_axis(identification: Selection, axis: str, threshold: float) -> list[Selection]:
-    """Return an effect without an axis; nothing if it does not reach the threshold elsewhere."""
-    elsewhere = [component for component in identification.components if axis not in component.row]
-    evidence_nats = sum(max(sum_evidence(layer), 0.0) for layer in split_layers(elsewhere))
-    if evidence_nats < threshold:
-        return []
-    return [reduce_selection(identification, elsewhere, evidence_nats)]
+def _without_axis(
+    identified: Sequence[Selection], reduced: Sequence[Selection], axis: str, threshold: float
+) -> list[Selection]:
+    """Return effects, some without an axis; these only if they reach the threshold elsewhere."""
+    out = []
+    for identification in identified:
+        if identification not in reduced:
+            out.append(identification)
+            continue
+        elsewhere = [part for part in identification.components if axis not in part.row]
+        evidence_nats = sum(max(sum_evidence(layer), 0.0) for layer in split_layers(elsewhere))
+        if evidence_nats >= threshold:
+            out.append(reduce_selection(identification, elsewhere, evidence_nats))
+    return out
 
 
 def _evidence_on(selection: Selection, axis: str) -> float:
