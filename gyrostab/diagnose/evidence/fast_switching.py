@@ -10,6 +10,7 @@ second-order statistics, and lines.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -17,6 +18,7 @@ import xarray as xr
 from gyrostab.arrays import Bools, Floats
 from gyrostab.diagnose.evidence.products import WIDTHS, marginalise, mean_products, scale_columns
 from gyrostab.diagnose.evidence.telegraph import (
+    DRIFT_WAVES,
     TelegraphCourses,
     course_evidence,
     drift_waves,
@@ -68,6 +70,18 @@ class SwitchingEvidence:
     refuted: bool = False
 
 
+class _SubBlockMeans(NamedTuple):
+    """Means over sub-blocks of an axis, in their order."""
+
+    values: Floats  # (mean,): 0 where missing [degree hour-1]
+    variance: Floats  # (mean,): expected white variance, 1 where missing
+    present: Bools  # (mean,)
+    given: Floats  # (mean, column): columns of effects in the model
+    step: float  # length [s]
+    merged: int  # sub-blocks in each
+    block_count: int
+
+
 def switching_evidence(
     data: xr.Dataset,
     baseline: xr.Dataset,
@@ -82,61 +96,57 @@ def switching_evidence(
     """
     if "record" in data.dims:
         return None
-    values, variance, merged = _sub_block_means(data, baseline, axis)
-    shape = values.shape
-    present = (np.isfinite(values) & np.isfinite(variance)).ravel()
-    if present.sum() < 10.0 * settings.min_switches or np.ptp(values.ravel()[present]) == 0.0:
+    means = _sub_block_means(data, baseline, axis, given)
+    measured = means.values[means.present]
+    if measured.size < 10.0 * settings.min_switches or np.ptp(measured) == 0.0:
         return None
-    step = float(data.attrs["block_s"]) / shape[1]
-    n = present.size
-    flat = np.where(present, values.ravel(), 0.0)[:, None]
-    variance = np.where(present, variance.ravel(), 1.0)
-    if given is not None:
-        parts = np.nan_to_num(given).reshape(shape[0], -1, merged, given.shape[2])
-        given = parts.mean(axis=2).reshape(-1, given.shape[2])
-    effect_columns = scale_columns(given, n)
-    best: SwitchingEvidence | None = None
-    for count in (0, 8):
-        columns_given = np.concatenate([drift_waves(n, count), effect_columns], axis=1)
-        courses = telegraph_courses(
-            flat,
-            variance,
-            present,
-            columns_given,
-            starts=_START_QUANTILES,
-            min_scatter=_MIN_WHITE_RATIO,
-            parts=_PARTS_PER_SUB_BLOCK,
-        )
-        evidence_nats, beyond_normal_nats = _course_evidence(
-            courses, flat, variance, present, effect_columns, step, baseline.sel(axis=axis)
-        )
-        evidence_nats -= np.log(2.0)
-        share = np.repeat(courses.share[0].reshape(shape), merged, axis=1)
-        levels_found = courses.switch_count[0] >= settings.min_switches and evidence_nats > 0.0
-        similar = levels_found and _is_like_two_levels(courses, variance, present, settings)
-        is_switching = similar and beyond_normal_nats > settings.two_level_nats
-        refuted = (
-            levels_found
-            and evidence_nats > settings.refuting_nats
-            and (not similar or beyond_normal_nats < -settings.refuting_nats)
-        )
-        result = SwitchingEvidence(
-            evidence_nats if is_switching else -np.inf,
-            share,
-            courses.times[0] * step,
-            float(courses.switch_count[0]),
-            bool(refuted),
-        )
-        best = (
-            result
-            if best is None or result.evidence_nats > best.evidence_nats
-            else replace(best, refuted=best.refuted and result.refuted)
-        )
-    return best
+    axis_baseline = baseline.sel(axis=axis)
+    first, second = (
+        _fit_two_levels(means, drift_waves(means.present.size, count), axis_baseline, settings)
+        for count in DRIFT_WAVES
+    )
+    best = second if second.evidence_nats > first.evidence_nats else first
+    return replace(best, refuted=first.refuted and second.refuted)
+
+
+def _fit_two_levels(
+    means: _SubBlockMeans, drift: Floats, baseline: xr.Dataset, settings: Settings
+) -> SwitchingEvidence:
+    """Compute the evidence of two levels with the columns of a drift (mean, column) in the model.
+
+    Half of the prior probability is that of another drift.
+    """
+    courses = telegraph_courses(
+        means.values[:, None],
+        means.variance,
+        means.present,
+        np.concatenate([drift, means.given], axis=1),
+        starts=_START_QUANTILES,
+        min_scatter=_MIN_WHITE_RATIO,
+        parts=_PARTS_PER_SUB_BLOCK,
+    )
+    evidence_nats, beyond_normal_nats = _course_evidence(courses, means, baseline)
+    evidence_nats -= np.log(2.0)
+    levels_found = courses.switch_count[0] >= settings.min_switches and evidence_nats > 0.0
+    similar = levels_found and _is_like_two_levels(courses, means, settings)
+    is_switching = similar and beyond_normal_nats > settings.two_level_nats
+    refuted = (
+        levels_found
+        and evidence_nats > settings.refuting_nats
+        and (not similar or beyond_normal_nats < -settings.refuting_nats)
+    )
+    share = courses.share[0].reshape(means.block_count, -1)
+    return SwitchingEvidence(
+        evidence_nats if is_switching else -np.inf,
+        np.repeat(share, means.merged, axis=1),
+        courses.times[0] * means.step,
+        float(courses.switch_count[0]),
+        bool(refuted),
+    )
 
 
 def _is_like_two_levels(
-    courses: TelegraphCourses, variance: Floats, present: Bools, settings: Settings
+    courses: TelegraphCourses, means: _SubBlockMeans, settings: Settings
 ) -> bool:
     """Return whether the bias is between its levels as rarely as a switching bias.
 
@@ -145,8 +155,8 @@ def _is_like_two_levels(
     """
     log, share = simulated_courses(
         courses,
-        variance,
-        present,
+        means.variance,
+        means.present,
         parts=_PARTS_PER_SUB_BLOCK,
         count=_SURROGATE_RECORDS,
         rng=np.random.default_rng(0),
@@ -165,88 +175,87 @@ def _is_like_two_levels(
 def _count_equal_neighbours(share: Floats, min_share: float) -> Floats:
     """Count neighbouring sub-blocks (record,) with equal shares, between the levels."""
     between = (share > min_share) & (share < 1.0 - min_share)
-    return np.asarray(
-        (between[:, 1:] & between[:, :-1] & (np.abs(np.diff(share, axis=1)) < min_share)).sum(
-            axis=1
-        )
-    )
+    is_equal = np.abs(np.diff(share, axis=1)) < min_share
+    return np.asarray((between[:, 1:] & between[:, :-1] & is_equal).sum(axis=1))
 
 
 def _sub_block_means(
-    data: xr.Dataset, baseline: xr.Dataset, axis: str
-) -> tuple[Floats, Floats, int]:
-    """Return means over sub-blocks, their white variance, and how many are merged in each."""
+    data: xr.Dataset, baseline: xr.Dataset, axis: str, given: Floats | None
+) -> _SubBlockMeans:
+    """Return means over sub-blocks, several of which are merged in long records."""
     axis_data, axis_baseline = data.sel(axis=axis), baseline.sel(axis=axis)
     samples = axis_data["sub_block_samples"].values.astype(np.float64)
-    mean = axis_data["sub_block_mean"].values
+    block_count = len(samples)
     merged = 1
     while samples.size // merged > _MAX_MEANS and merged < samples.shape[1]:
         merged *= 2
-    sums = np.where(samples > 0, np.nan_to_num(mean) * samples, 0.0)
-    count, total = (part.reshape(len(samples), -1, merged).sum(axis=2) for part in (samples, sums))
+    sums = np.where(samples > 0, np.nan_to_num(axis_data["sub_block_mean"].values) * samples, 0.0)
+    count, total = (part.reshape(block_count, -1, merged).sum(axis=2) for part in (samples, sums))
     enough = (count >= _MIN_SAMPLE_SHARE * max(np.median(count), 1.0)) & np.isfinite(
         axis_data["mean"].values
     )[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = (
-            np.where(enough, total / count, np.nan) - axis_baseline["known_mean"].values[:, None]
-        )
+        values = total / count - axis_baseline["known_mean"].values[:, None]
         variance = (axis_baseline["mean_variance"].values * axis_data["samples"].values)[
             :, None
         ] / count
-    return values, np.where(enough, variance, np.nan), merged
+    present = (enough & np.isfinite(values) & np.isfinite(variance)).ravel()
+    if given is not None:
+        parts = np.nan_to_num(given).reshape(block_count, -1, merged, given.shape[2])
+        given = parts.mean(axis=2).reshape(-1, given.shape[2])
+    return _SubBlockMeans(
+        np.where(present, values.ravel(), 0.0),
+        np.where(present, variance.ravel(), 1.0),
+        present,
+        scale_columns(given, present.size),
+        float(data.attrs["block_s"]) / count.shape[1],
+        merged,
+        block_count,
+    )
 
 
 def _course_evidence(
-    courses: TelegraphCourses,
-    values: Floats,
-    variance: Floats,
-    present: Bools,
-    given: Floats,
-    step: float,
-    baseline: xr.Dataset,
+    courses: TelegraphCourses, means: _SubBlockMeans, baseline: xr.Dataset
 ) -> tuple[float, float]:
     """Return evidence over white noise with a walk, and over noise of any spectrum [nats]."""
     K, B, prior = _slow_noise_grid(baseline)
-    base = {"step": step, "K": K, "B": B, "present": present}
-    columns = np.concatenate([courses.share.T, given], axis=1)
-    columns_given = given.shape[1]
+    columns = np.concatenate([courses.share.T, means.given], axis=1)
+    values, present = means.values[:, None], means.present
     logs = []
-    scales = _white_levels(courses, values[:, 0], variance, present)
+    scales = _white_levels(courses, means)
     for scale in scales:
-        white = {**base, "variance": variance * scale}
-        plain = mean_products(values, columns, **white)
+        variance = means.variance * scale
+        plain = mean_products(
+            values, columns, variance=variance, step=means.step, K=K, B=B, present=present
+        )
         wide = np.diag(np.maximum(np.diagonal(plain.gram[0])[1:], 1e-300)) / WIDTHS[-1] ** 2
-        scatter = float(courses.spread[0] @ np.where(present, 1.0 / white["variance"], 0.0))
+        scatter = float(courses.spread[0] @ np.where(present, 1.0 / variance, 0.0))
         usual = courses.share[0][present]
-        unit = float(((usual - usual.mean()) ** 2 / white["variance"][present]).sum())
-        marginal = marginalise(plain, columns_given, wide)
+        unit = float(((usual - usual.mean()) ** 2 / variance[present]).sum())
+        marginal = marginalise(plain, means.given.shape[1], wide)
         logs.append(course_evidence(marginal, 0, scatter, prior, unit=unit))
     none, two = (np.logaddexp.reduce(logs, axis=0) - np.log(scales.size)).tolist()
     two -= float(courses.cost[0])
-    return two - none, two - _normal_log_likelihood(values[:, 0], variance, present, given)
+    return two - none, two - _normal_log_likelihood(means)
 
 
-def _normal_log_likelihood(
-    values: Floats, variance: Floats, present: Bools, given: Floats
-) -> float:
+def _normal_log_likelihood(means: _SubBlockMeans) -> float:
     """Return the log likelihood of normal noise of any spectrum, in units of `course_evidence`.
 
     The spectrum is autoregressive; each coefficient costs half the logarithm of the number of data
     (Schwarz, 1978, doi:10.1214/aos/1176344136).
     """
-    columns_given = np.concatenate([np.ones((present.size, 1)), given], axis=1)
+    values, present = means.values, means.present
+    columns_given = np.concatenate([np.ones((present.size, 1)), means.given], axis=1)
     size, *_ = np.linalg.lstsq(columns_given[present], values[present], rcond=None)
     y = np.where(present, values - columns_given @ size, 0.0)
     n = int(present.sum())
-    constant = 0.5 * np.log(np.median(variance[present]) / n)  # evidence of a free constant
+    constant = 0.5 * np.log(np.median(means.variance[present]) / n)  # evidence of a free constant
     best = -np.inf
     for order in (order for order in _AR_ORDERS if order < n / 10):
-        lags = (
-            np.stack([np.roll(y, lag) for lag in range(1, order + 1)], axis=1)
-            if order
-            else np.empty((y.size, 0))
-        )
+        lags = np.empty((y.size, order))
+        for lag in range(1, order + 1):
+            lags[:, lag - 1] = np.roll(y, lag)
         usable = present & np.all([np.roll(present, lag) for lag in range(order + 1)], axis=0)
         usable[:order] = False
         used, unpredicted = int(usable.sum()), present & ~usable
@@ -254,11 +263,8 @@ def _normal_log_likelihood(
             continue
         factor, *_ = np.linalg.lstsq(lags[usable], y[usable], rcond=None)
         log = -0.5 * used * (1.0 + np.log(np.mean((y[usable] - lags[usable] @ factor) ** 2)))
-        log -= (
-            0.5 * unpredicted.sum() * (1.0 + np.log(np.mean(y[unpredicted] ** 2)))
-            if unpredicted.any()
-            else 0.0
-        )
+        if unpredicted.any():
+            log -= 0.5 * unpredicted.sum() * (1.0 + np.log(np.mean(y[unpredicted] ** 2)))
         best = max(best, float(log) - 0.5 * order * np.log(n))
     return float(best + constant)
 
@@ -275,21 +281,17 @@ def _slow_noise_grid(baseline: xr.Dataset) -> tuple[Floats, Floats, Floats]:
     return K[chosen], B[chosen], free[chosen] - np.logaddexp.reduce(free[chosen])
 
 
-def _white_levels(
-    courses: TelegraphCourses, values: Floats, variance: Floats, present: Bools
-) -> Floats:
+def _white_levels(courses: TelegraphCourses, means: _SubBlockMeans) -> Floats:
     """Return relative white levels to try; some from differences of neighbours."""
-    pair_present = present[1:] & present[:-1]
+    pair_present = means.present[1:] & means.present[:-1]
+    pair_variance = (means.variance[1:] + means.variance[:-1])[pair_present]
+    steps = np.array([1.0 / _WHITE_LEVEL_STEP, 1.0, _WHITE_LEVEL_STEP])
     ratios = [1.0, 2.0, 4.0]
-    for residual in (values, values - courses.step[0] * courses.share[0]):
-        square = np.diff(residual)[pair_present] ** 2 / (variance[1:] + variance[:-1])[pair_present]
+    for residual in (means.values, means.values - courses.step[0] * courses.share[0]):
+        square = np.diff(residual)[pair_present] ** 2 / pair_variance
         ratios += [
             float(np.mean(square)),
-            *(
-                float(np.median(square))
-                / _NORMAL_SQUARE_MEDIAN
-                * np.array([1.0 / _WHITE_LEVEL_STEP, 1.0, _WHITE_LEVEL_STEP])
-            ),
+            *(float(np.median(square)) / _NORMAL_SQUARE_MEDIAN * steps),
         ]
     return np.unique(np.maximum(ratios, 1e-12))
 

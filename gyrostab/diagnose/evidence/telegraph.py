@@ -48,7 +48,7 @@ _START_TIME_BLOCKS = 5.0  # mean time at the start of the search; design choice
 START_QUANTILES = ((0.05, 0.95), (0.25, 0.75), (0.05, 0.5), (0.5, 0.95))
 _TRIAL_ROUNDS, _ROUNDS, _FINE_ROUNDS = 3, 14, 60  # of expectation and maximisation; limit time
 _CONVERGED = 0.01  # in white noise deviations, or in the logarithm of a time
-_DRIFT_WAVES = (0, 8)  # slow cosines in the model while the course is searched; design choice
+DRIFT_WAVES = (0, 8)  # slow cosines in the model while the course is searched; design choice
 _HEIGHT_SCATTER = 0.5  # of an arbitrary course, relative to its step; design choice
 
 
@@ -285,12 +285,12 @@ def telegraph_evidence(
     log_weight = axis_values(baseline, "grid_prior", axis)
     safe = np.where(present[:, None], values, 0.0)
     evidence_nats, attempts = [], []
-    for count in _DRIFT_WAVES:
+    for count in DRIFT_WAVES:
         columns = np.concatenate([drift_waves(n, count), scaled_given], axis=1)
         courses = telegraph_courses(safe, variance, present, columns)
         worth = _course_evidence_by_record(courses, safe, scaled_given, setup, log_weight)
         has_switches = courses.switch_count >= settings.min_switches
-        evidence_nats.append(np.where(has_switches, worth - np.log(len(_DRIFT_WAVES)), -np.inf))
+        evidence_nats.append(np.where(has_switches, worth - np.log(len(DRIFT_WAVES)), -np.inf))
         attempts.append(courses)
     chosen = np.argmax(evidence_nats, axis=0)
     by_attempt = zip(*attempts, strict=True)
