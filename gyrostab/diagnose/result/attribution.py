@@ -28,6 +28,8 @@ from gyrostab.diagnose.statistics.sample_counts import find_anomalous_blocks, ma
 
 #: Name, scores and standardised scores of each statistic.
 _Scores = Sequence[tuple[str, xr.Dataset, Floats]]
+#: Takes effects to leave out; returns the score that is left at a mismatch, and that of a mismatch.
+ScoreLeft = Callable[[Sequence[Selection]], tuple[float, float]]
 
 
 class _TimedEffect(NamedTuple):
@@ -73,7 +75,7 @@ def attribute_mismatches(
             blocks, baseline, null, located, remaining, lines_at_rest=lines_at_rest
         )
 
-    def score_without(region: Region, out: Sequence[Selection]) -> tuple[float, float]:
+    def score_left(region: Region, out: Sequence[Selection]) -> tuple[float, float]:
         return _score_left(region, scores_without(tuple(out)), null, level)
 
     timed_effects = [
@@ -84,49 +86,52 @@ def attribute_mismatches(
         )
         for identification in identified
     ]
-    explained = []
-    for region in located:
-        score, limit = score_without(region, ())
-        shown = []
-        for effect in timed_effects:
-            without_it = partial(score_without, region, (effect.identification,))
-            components = _components_at(
-                region,
-                effect,
-                blocks,
-                settings,
-                is_left=score >= limit,
-                score_without=None if without is None else without_it,
-            )
-            if components:
-                shown.append((effect.identification, components))
-        is_gone = without is not None and score < limit
-        needed = (
-            needed_effects(region, shown, partial(score_without, region), settings=settings)
-            if is_gone
-            else [identification for identification, _ in shown]
+    return [
+        _explain_mismatch(
+            region,
+            timed_effects,
+            blocks,
+            partial(score_left, region),
+            is_tested=without is not None,
+            settings=settings,
         )
-        explained.append(list(dict.fromkeys(identification.effect for identification in needed)))
-    return explained
+        for region in located
+    ]
+
+
+def _explain_mismatch(
+    region: Region,
+    timed_effects: Sequence[_TimedEffect],
+    blocks: xr.Dataset,
+    left: ScoreLeft,
+    *,
+    is_tested: bool,
+    settings: Settings,
+) -> list[str]:
+    """Return the effects that explain a mismatch; `is_tested` says whether they must be needed."""
+    score, limit = left(())
+    shown = []
+    for effect in timed_effects:
+        components = _components_at(region, effect, blocks, settings, is_left=score >= limit)
+        if components and (
+            _acts_at(region, effect, blocks, settings)
+            or (is_tested and _is_caused_elsewhere(region, effect, components, left))
+        ):
+            shown.append((effect.identification, components))
+    needed = [identification for identification, _ in shown]
+    if is_tested and score < limit:
+        needed = needed_effects(region, shown, left, settings=settings)
+    return list(dict.fromkeys(identification.effect for identification in needed))
 
 
 def _components_at(
-    region: Region,
-    effect: _TimedEffect,
-    blocks: xr.Dataset,
-    settings: Settings,
-    *,
-    is_left: bool,
-    score_without: Callable[[], tuple[float, float]] | None,
+    region: Region, effect: _TimedEffect, blocks: xr.Dataset, settings: Settings, *, is_left: bool
 ) -> list[Component]:
-    """Return the components of an effect that may explain a mismatch; empty if it cannot.
+    """Return the components of an effect that can show in a mismatch, on its axes; or none.
 
-    `is_left` says whether the mismatch is left with all effects in the baseline, `score_without`
-    returns its score and limit without this one.
+    `is_left` says whether the mismatch is left with all effects in the baseline.
     """
-    has_moved = _is_within_blocks(region, blocks) and any(
-        _overlap_seconds(region, span) > 0.0 for span in effect.moving_spans
-    )
+    has_moved = _has_moved(region, effect, blocks)
     components = [
         component
         for component in effect.identification.components
@@ -134,23 +139,30 @@ def _components_at(
         and (has_moved or not component.statistic.is_in_means or region["view"] != "spectrum")
     ]
     common = set(region["axes"].split()) & set(effect.identification.axes)
-    if not components or not common:
-        return []
     together = region["quantity"] == "slow" and len(common) > 1
-    if is_left and all(
+    is_modelled = all(
         component.statistic.is_modelled_in(region, together=together) for component in components
-    ):
-        return []
-    is_at_its_time = has_moved or any(
+    )
+    return [] if not common or (is_left and is_modelled) else components
+
+
+def _has_moved(region: Region, effect: _TimedEffect, blocks: xr.Dataset) -> bool:
+    """Return whether an effect moves the rate within the blocks of a mismatch of their inside."""
+    is_within_blocks = region["view"] in ("spectrum", "distribution") or float(
+        region["tau_max_s"]
+    ) < float(blocks.attrs["block_s"])
+    return is_within_blocks and any(
+        _overlap_seconds(region, span) > 0.0 for span in effect.moving_spans
+    )
+
+
+def _acts_at(region: Region, effect: _TimedEffect, blocks: xr.Dataset, settings: Settings) -> bool:
+    """Return whether an effect acts at the time of a mismatch."""
+    return _has_moved(region, effect, blocks) or any(
         _overlap_seconds(region, (begin, end))
         >= settings.overlap_share * min(region["end"] - region["begin"], end - begin)
         for begin, end in effect.active_spans
     )
-    if is_at_its_time or (
-        score_without is not None and _is_caused_elsewhere(region, components, score_without)
-    ):
-        return components
-    return []
 
 
 def drop_expected(
@@ -192,9 +204,7 @@ def drop_expected(
 
 
 def _is_caused_elsewhere(
-    region: Region,
-    components: Sequence[Component],
-    score_without: Callable[[], tuple[float, float]],
+    region: Region, effect: _TimedEffect, components: Sequence[Component], left: ScoreLeft
 ) -> bool:
     """Return whether a mismatch of the mean is due to what an effect does at other times.
 
@@ -205,7 +215,7 @@ def _is_caused_elsewhere(
         component.statistic.is_in_means for component in components
     ):
         return False
-    score, limit = score_without()
+    score, limit = left((effect.identification,))
     return score >= limit
 
 
@@ -223,13 +233,6 @@ def _explained_spans(
 
 def _overlap_seconds(region: Region, span: tuple[float, float]) -> float:
     return float(min(region["end"], span[1]) - max(region["begin"], span[0]))
-
-
-def _is_within_blocks(region: Region, blocks: xr.Dataset) -> bool:
-    """Return whether a mismatch concerns the inside of blocks rather than their means."""
-    return region["view"] in ("spectrum", "distribution") or float(region["tau_max_s"]) < float(
-        blocks.attrs["block_s"]
-    )
 
 
 def _moving_spans(
@@ -362,7 +365,7 @@ def _score_left(
 def needed_effects(
     region: Region,
     shown: Sequence[tuple[Selection, Sequence[Component]]],
-    left: Callable[[Sequence[Selection]], tuple[float, float]],
+    left: ScoreLeft,
     *,
     settings: Settings = DEFAULTS,
 ) -> list[Selection]:
@@ -376,8 +379,7 @@ def needed_effects(
     contributor.
 
     Those `shown` act there and together remove it, each with its components that can show in its
-    statistic. `left` takes effects to leave out, and returns the score that is left, and the score
-    of a mismatch.
+    statistic.
     """
     weighed = [
         identification
