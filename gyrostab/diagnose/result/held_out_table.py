@@ -11,7 +11,7 @@ from itertools import compress
 import numpy as np
 import xarray as xr
 
-from gyrostab.arrays import Array, Bools, Floats
+from gyrostab.arrays import Array, Bools, Floats, Ints
 from gyrostab.diagnose.baseline.calibrate import calibrate_on_training_blocks
 from gyrostab.diagnose.baseline.expected_statistics import reduced_shape
 from gyrostab.diagnose.estimate.conditioned_baseline import expected_baseline, predict_baseline
@@ -68,8 +68,15 @@ def measure_held_out(
     )
     anomalous = components_of([*identified, *with_course.expected])
     clean = mask_anomalous_blocks(blocks, anomalous, settings)
-    calibrate = _make_calibration(blocks, baseline, settings)
+    responses = cache(partial(logger_responses, blocks))
 
+    @_remember_fits
+    def calibrate(training: Bools) -> xr.Dataset:
+        return calibrate_on_training_blocks(
+            blocks, baseline, training, responses=responses, settings=settings
+        )
+
+    @_remember_fits
     def before(training: Bools) -> xr.Dataset:
         return expected_baseline(with_course, calibrate(training), training)
 
@@ -81,8 +88,7 @@ def measure_held_out(
         left_out = tuple(compress(renewed.identified, is_left_out))
         return predict_baseline(renewed, noise, training, left_out=left_out)
 
-    after = partial(train, judged) if judged.identified else before
-    with_phase_locked = partial(train, with_course) if identified else before
+    after = _remember_fits(partial(train, judged)) if judged.identified else before
     training = select_forecast_start(blocks)
     begun, is_over = _list_begun(judged.identified, blocks, training, settings)
     has_forecast = not all(is_over)
@@ -91,7 +97,7 @@ def measure_held_out(
         before,
         after,
         added_nats=count_nats + random_nats + phase_locked_nats,
-        shown=with_phase_locked if phase_locked_nats else after,
+        shown=partial(train, with_course) if phase_locked_nats else after,
         forecast=partial(train, replace(judged, identified=begun), is_left_out=is_over)
         if has_forecast
         else before,
@@ -101,20 +107,17 @@ def measure_held_out(
     return evidence
 
 
-def _make_calibration(blocks: xr.Dataset, baseline: xr.Dataset, settings: Settings) -> FitBaseline:
-    """Return what calibrates the noise on training blocks, once on each set of them."""
-    calibrated: dict[bytes, xr.Dataset] = {}  # by the training blocks
-    responses = cache(partial(logger_responses, blocks))
+def _remember_fits(fit: FitBaseline) -> FitBaseline:
+    """Return what fits a baseline once to each set of blocks."""
+    fitted: dict[bytes, xr.Dataset] = {}
 
-    def calibrate(training: Bools) -> xr.Dataset:
+    def recall(training: Bools) -> xr.Dataset:
         place = training.tobytes()
-        if place not in calibrated:
-            calibrated[place] = calibrate_on_training_blocks(
-                blocks, baseline, training, responses=responses, settings=settings
-            )
-        return calibrated[place]
+        if place not in fitted:
+            fitted[place] = fit(training)
+        return fitted[place]
 
-    return calibrate
+    return recall
 
 
 def _list_begun(
@@ -234,43 +237,44 @@ def held_out(
         ``forecast_gain`` [nats] on the last 30 % of models fitted to the first 70 %.
     """
     windows = cut_held_out_stretches(blocks)
-    fold_of_window = np.arange(windows.first.size) % FOLDS
-    stretches = np.repeat(fold_of_window, windows.length)
-    nats_by_length: list[Floats] = []
-    moves = False
-    squares: dict[str, list[Floats]] = {"before": [], "after": []}
-    for fold in (stretches, *fold_blocks(blocks).values[1:]):
-        length_nats = np.array([added_nats, 2.0 * abs(added_nats)])
-        for number in range(FOLDS):
-            held = fold == number
-            models = {"before": before(~held), "after": after(~held)}
-            length_nats = length_nats + _compare_models(
-                blocks, models["before"], models["after"], held
-            )
-            moves |= not models["after"]["known_mean"].equals(models["before"]["known_mean"])
-            if nats_by_length:
-                continue  # the Allan variance is compared on the stretches
-            if shown is not after:
-                models["after"] = shown(~held)
-            chosen = fold_of_window == number
-            inside = BlockWindows(windows.first[chosen], windows.stop[chosen])
-            for name, baseline in models.items():
-                squares[name].append(_allan_scores(blocks, baseline, inside))
-        nats_by_length.append(length_nats)
-        if not moves:
-            break
-    evidence_nats, variance = max(length_nats.tolist() for length_nats in nats_by_length)
+    stretches = np.repeat(np.arange(windows.first.size) % FOLDS, windows.length)
+    gain, moves = _compare_on_folds(blocks, before, after, stretches, added_nats)
+    gains = [gain]
+    for fold in fold_blocks(blocks).values[1:] if moves else ():
+        gains.append(_compare_on_folds(blocks, before, after, fold, added_nats)[0])
+    evidence_nats, variance = max(of_length.tolist() for of_length in gains)
     training = select_forecast_start(blocks)
     late, early = (
         log_likelihood(blocks, model(training), training, ~training) for model in (forecast, before)
     )
+    squares = {
+        name: _allan_scores(blocks, fit, windows)
+        for name, fit in (("before", before), ("after", shown))
+    }
     return {
         "blocks": windows.first.size,
         "log_likelihood_gain": evidence_nats,
         "stderr": math.sqrt(variance),
-        **_summarise_scores(squares),
+        **{f"misfit_{name}": _average_cells(values) for name, values in squares.items()},
+        **{
+            f"coverage95_{name}": _average_cells(values < NORMAL_95**2)
+            for name, values in squares.items()
+        },
         "forecast_gain": late - early,
     }
+
+
+def _compare_on_folds(
+    blocks: xr.Dataset, before: FitBaseline, after: FitBaseline, fold: Ints, added_nats: float
+) -> tuple[Floats, bool]:
+    """Return the gain on all folds (block,) and its variance, and whether the means differ."""
+    gain, moves = np.array([added_nats, 2.0 * abs(added_nats)]), False
+    for number in range(FOLDS):
+        held = fold == number
+        without, with_effects = before(~held), after(~held)
+        gain = gain + _compare_models(blocks, without, with_effects, held)
+        moves |= not with_effects["known_mean"].equals(without["known_mean"])
+    return gain, moves
 
 
 def _compare_models(
@@ -386,35 +390,32 @@ def _mean_evidence(blocks: xr.Dataset, baseline: xr.Dataset, axis: str, used: Bo
     return products_mixture(products, weight - np.logaddexp.reduce(weight)).evidence
 
 
-def _allan_scores(blocks: xr.Dataset, baseline: xr.Dataset, held: BlockWindows) -> Floats:
+def _allan_scores(blocks: xr.Dataset, fit: FitBaseline, stretches: BlockWindows) -> Floats:
     """Return squared scores of the Allan variance in disjoint windows of held-out stretches."""
-    first, stop = [held.first], [held.stop]
-    for length in {1, min(SHORT_WINDOW_BLOCKS, int((held.stop - held.first).min()))}:
-        inside = [
-            np.arange(low, high - length + 1, length)
-            for low, high in zip(held.first, held.stop, strict=True)
-        ]
-        start = np.concatenate(inside)
-        first.append(start)
-        stop.append(start + length)
-    windows = BlockWindows(np.concatenate(first), np.concatenate(stop))
-    surface = allan_surface(blocks, baseline, windows)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        z = cube_root_score(surface["observed"] / surface["expected"], surface["shape"])[
-            ..., surface["columns"]["quantity"] == "avar"
-        ]
-    return np.asarray(z[np.isfinite(z)] ** 2)
+    squares = []
+    for number in range(FOLDS):
+        is_held = np.arange(stretches.first.size) % FOLDS == number
+        held = BlockWindows(stretches.first[is_held], stretches.stop[is_held])
+        baseline = fit(~np.repeat(is_held, stretches.length))
+        first, stop = [held.first], [held.stop]
+        for length in {1, min(SHORT_WINDOW_BLOCKS, int(held.length.min()))}:
+            inside = [
+                np.arange(low, high - length + 1, length) for low, high in zip(*held, strict=True)
+            ]
+            start = np.concatenate(inside)
+            first.append(start)
+            stop.append(start + length)
+        windows = BlockWindows(np.concatenate(first), np.concatenate(stop))
+        surface = allan_surface(blocks, baseline, windows)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = cube_root_score(surface["observed"] / surface["expected"], surface["shape"])
+        z = z[..., surface["columns"]["quantity"] == "avar"]
+        squares.append(z[np.isfinite(z)] ** 2)
+    return np.concatenate(squares)
 
 
-def _summarise_scores(squares: dict[str, list[Floats]]) -> dict[str, float]:
-    def mean(values: Array) -> float:
-        return float(values.mean()) if values.size else np.nan
-
-    cells = {name: np.concatenate(parts) for name, parts in squares.items()}
-    misfit = {f"misfit_{name}": mean(values) for name, values in cells.items()}
-    return misfit | {
-        f"coverage95_{name}": mean(values < NORMAL_95**2) for name, values in cells.items()
-    }
+def _average_cells(values: Array) -> float:
+    return float(values.mean()) if values.size else np.nan
 
 
 def select_forecast_start(blocks: xr.Dataset) -> Bools:
