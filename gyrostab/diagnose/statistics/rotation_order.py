@@ -271,8 +271,6 @@ def _visible_lines(line_power: Array, axis: str, state: State) -> Bools:
 
 def turns_per_second(blocks: xr.Dataset) -> Array:
     """Return turns per second in each block."""
-    if "channel_rotation_rate" not in blocks:
-        return np.zeros(blocks.sizes["block"])
     return np.asarray(np.nan_to_num(np.abs(blocks["channel_rotation_rate"].values) / 360.0))
 
 

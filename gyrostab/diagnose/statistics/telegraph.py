@@ -33,7 +33,7 @@ from gyrostab.diagnose.predict.candidates import (
 from gyrostab.diagnose.predict.condition import mean_columns
 from gyrostab.diagnose.predict.linear_model import State, power_column
 from gyrostab.diagnose.predict.search import Trial
-from gyrostab.diagnose.predict.sizes import component_mixture
+from gyrostab.diagnose.predict.sizes import component_size
 from gyrostab.diagnose.reduce.schema import axis_values
 from gyrostab.diagnose.statistics.base import Competitor, SizeFit, Sizes
 from gyrostab.diagnose.statistics.mean import BlockMeanStatistic, mean_inputs
@@ -103,7 +103,7 @@ class TelegraphStatistic(BlockMeanStatistic):
         evidence_nats = np.full((records, len(rows)), -np.inf)
         courses: list[tuple[TelegraphCourses, SwitchingEvidence | None]] = []
         for row, axis in enumerate(trial.state.axes):
-            axis_nats, course, within, refuted = trial.recall(
+            axis_nats, course, within = trial.recall(
                 partial(_search_axis, searched, trial.state, axis),
                 group,
                 *mean_inputs(trial, axis),
@@ -114,10 +114,6 @@ class TelegraphStatistic(BlockMeanStatistic):
                 ),
             )
             evidence_nats[: axis_nats.size, row] = axis_nats
-            if refuted:
-                evidence_nats[0, row] = -np.inf
-            if within is not None:
-                evidence_nats[0, row] = max(within.evidence_nats, evidence_nats[0, row])
             courses.append((course, within))
         out = []
         for candidate in group:
@@ -161,19 +157,13 @@ class TelegraphStatistic(BlockMeanStatistic):
         negative step.
         """
         ranked = sorted(fit.components, key=lambda component: -component.evidence_nats)
-        name, first = ranked[0].variant.columns[0], ranked[0].variant
-        course = first.design[0, 0]
+        first = ranked[0].variant
         out: dict[str, tuple[float, float]] = {}
         for component in ranked:
-            mean, covariance = component_mixture(component, fit.state).moments()
-            component_course = component.variant.design[0, 0]
-            sign = (
-                1.0
-                if component is ranked[0] or float(np.cov(component_course, course)[0, 1]) >= 0.0
-                else -1.0
-            )
-            key = fit.key(name, component.row[0])
-            out[key] = (sign * float(mean[0]), float(math.sqrt(covariance[0, 0])))
+            size, error = component_size(component, fit.state)
+            is_alike = np.cov(component.variant.design[0, 0], first.design[0, 0])[0, 1] >= 0.0
+            key = fit.key(first.columns[0], component.row[0])
+            out[key] = (size if is_alike else -size, error)
         stays = max(float(first.values["switches"]) / 2.0, 1.0)  # on either level
         return out | {
             time: (float(first.values[time]), float(first.values[time]) / math.sqrt(stays))
@@ -183,25 +173,28 @@ class TelegraphStatistic(BlockMeanStatistic):
 
 def _search_axis(
     data: xr.Dataset, state: State, axis: str
-) -> tuple[Floats, TelegraphCourses, SwitchingEvidence | None, bool]:
+) -> tuple[Floats, TelegraphCourses, SwitchingEvidence | None]:
     """Search an axis for two levels in block means, and then within blocks.
 
-    The switching within blocks is None unless it is better; the last result is whether it refutes
-    that in block means.
+    Return the evidence (record,), the courses of block means, and the switching within blocks,
+    which is None unless it is better.
     """
     evidence_nats, course = search_block_means(state, axis, data)
     switching, block = _search_sub_blocks(data, state, axis), float(state.blocks.attrs["block_s"])
     if switching is None:
-        return evidence_nats, course, None, False
+        return evidence_nats, course, None
     if not _is_resolved(switching, state):
-        is_short = float(course.times[0].min()) < state.settings.refuted_blocks
-        return evidence_nats, course, None, switching.refuted and is_short
+        if switching.refuted and float(course.times[0].min()) < state.settings.refuted_blocks:
+            evidence_nats[0] = -np.inf
+        return evidence_nats, course, None
     deviation = float(np.sqrt(np.nanmedian(axis_values(state.baseline, "mean_variance", axis))))
     # in block means the share of a block on a level is known to half of one of its parts
     error = float(course.step[0]) / (2.0 * PARTS_PER_BLOCK)
     coarse = np.isfinite(evidence_nats[0]) and error < state.settings.visible_sigma * deviation
-    is_slow = switching.times.min() > state.settings.fast_blocks * block
-    return evidence_nats, course, None if coarse and is_slow else switching, False
+    if coarse and switching.times.min() > state.settings.fast_blocks * block:
+        return evidence_nats, course, None
+    evidence_nats[0] = max(switching.evidence_nats, evidence_nats[0])
+    return evidence_nats, course, switching
 
 
 def _with_free_levels(evidence: CandidateEvidence, trial: Trial) -> CandidateEvidence:

@@ -128,20 +128,19 @@ def reference_channel_of(
     Shapes (block, band, record) and (block, band). Expected cross-spectra are subtracted.
     """
     axes = [str(axis) for axis in blocks.variables["axis"].values]
-    if name in axes:
-        cross = records_last(read_as_measured(data, "cross").values, 3)
-        has_power = np.isfinite(blocks.variables["power"].values[row])[..., None]
-        cross = cross - expected_cross(baseline, blocks)[..., None]
-        cross_power = np.full(cross.shape[1:], np.nan + 0j)
-        for number, pair in enumerate(pair_rows(blocks)):
-            if set(pair) == {name, axes[row]} and name != axes[row]:
-                cross_power = np.where(
-                    has_power, np.conj(cross[number]) if pair[0] == name else cross[number], np.nan
-                )
-        return cross_power, reference_channel_power(name, blocks)
-    place = _reference_channels(blocks).index(name)
-    cross = records_last(data["reference_cross"].values, 4)
-    return cross[row, place], reference_channel_power(name, blocks)
+    power = reference_channel_power(name, blocks)
+    if name not in axes:
+        cross = records_last(data["reference_cross"].values, 4)
+        return cross[row, _reference_channels(blocks).index(name)], power
+    cross = records_last(read_as_measured(data, "cross").values, 3)
+    cross = cross - expected_cross(baseline, blocks)[..., None]
+    if name == axes[row]:
+        return np.full(cross.shape[1:], np.nan + 0j), power
+    pairs = pair_rows(blocks)
+    number = next(place for place, pair in enumerate(pairs) if set(pair) == {name, axes[row]})
+    of_pair = np.conj(cross[number]) if pairs[number][0] == name else cross[number]
+    has_power = np.isfinite(blocks.variables["power"].values[row])[..., None]
+    return np.where(has_power, of_pair, np.nan), power
 
 
 def _moving_share(name: str, power: Array, state: State) -> Array:
