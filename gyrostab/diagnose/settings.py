@@ -464,6 +464,10 @@ class Settings:
         """
         return 0.5 * self.active_share
 
+    def allow_form_error(self, evidence_nats: float) -> float:
+        """Return by how much another form must be better than one with this evidence [nats]."""
+        return self.ambiguous_nats + self.form_error_share * evidence_nats
+
     @classmethod
     def table(cls) -> str:
         """Return the settings with value, unit, meaning and source as a Markdown table."""

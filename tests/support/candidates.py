@@ -31,7 +31,7 @@ def select_candidate(candidates: Iterable[Candidate], effect: str, statistic: st
 def find_components(candidates: Sequence[Candidate], state: State) -> dict[str, list[Component]]:
     """Return the components of candidates by key, by their evidence on the blocks of a state."""
     blocks = state.blocks
-    return group_components(compute_evidence(candidates, blocks, state))
+    return group_components(compute_evidence(candidates, blocks, state), state.settings)
 
 
 def winning_forms(components: Sequence[Component], state: State, error: float = 0.0) -> set[str]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence, Component, Variant
 from gyrostab.diagnose.predict.search import combine_rows
-from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.settings import Settings
 
 #: The effect for a line of unknown cause.
 PLAIN_LINE = "spectral_line"
@@ -42,13 +42,12 @@ def _close_variants(
         return ()
     nats = evidence.variant_nats[:, row]
     order, best = np.argsort(-nats, kind="stable"), float(nats.max())
-    allowed = settings.ambiguous_nats + settings.form_error_share * max(best, 0.0)
-    good = nats[order] >= best - allowed
+    good = nats[order] >= best - settings.allow_form_error(max(best, 0.0))
     return tuple(evidence.candidate.variants[place] for place in order[good].tolist())
 
 
 def group_components(
-    all_evidence: Sequence[CandidateEvidence], *, settings: Settings = DEFAULTS
+    all_evidence: Sequence[CandidateEvidence], settings: Settings
 ) -> dict[str, list[Component]]:
     """Return the components of each effect with enough evidence, the strongest first."""
     out: dict[str, list[Component]] = {}

@@ -66,14 +66,14 @@ class Examination:
         self, candidates: Sequence[Candidate], state: State
     ) -> dict[str, list[Component]]:
         """Return the components of candidates by key, the strongest first."""
-        return group_components(self.compute_evidence(candidates, state), settings=self.settings)
+        return group_components(self.compute_evidence(candidates, state), self.settings)
 
     def required_nats(
         self, components: Sequence[Component], selections: Iterable[Selection]
     ) -> float:
         """Return the evidence that components need in addition to the selections [nats]."""
         others = [*self.expected, *selections]
-        return self.threshold + form_error(components, others, settings=self.settings)
+        return self.threshold + form_error(components, others, self.settings)
 
 
 def prepare_examination(

@@ -124,7 +124,7 @@ def prefer_plainer(component: Component, state: State) -> Component:
     if is_single:  # rounding or chance may have put another term ahead
         own = component.variant.columns[0]
         own_nats = _explained_nats(component, state)
-        needed_nats = own_nats - settings.ambiguous_nats - settings.form_error_share * own_nats
+        needed_nats = own_nats - settings.allow_form_error(own_nats)
         close = [name for name in terms if name == own or term_nats[name] > needed_nats]
         if len(close) < 2:
             return component

@@ -196,7 +196,7 @@ def _select_next(
         if shifted:
             continue
         best = option[0][1]
-        min_nats = ambiguous_evidence(best, sum_evidence(best), settings=examination.settings)
+        min_nats = ambiguous_evidence(best, sum_evidence(best), examination.settings)
         close = [
             components[other][0].candidate.effect
             for other in rivals
@@ -225,7 +225,7 @@ def _begin_round(
 
     Only effects that would pass are tested. Those that another form beats are added to `beaten`.
     """
-    components = merge_lines(group_components(all_evidence, settings=examination.settings))
+    components = merge_lines(group_components(all_evidence, examination.settings))
     required = {}
     for key, own in components.items():
         required[key] = examination.required_nats(own, chosen)

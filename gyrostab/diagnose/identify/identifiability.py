@@ -272,8 +272,7 @@ def find_spectral_alternatives(
     for component in powers:
         evidence = examination.compute_evidence([_any_spectrum(component, state)], state)[0]
         free += float(evidence.evidence_nats[0, evidence.rows.index(component.row)])
-    allowed = state.settings.ambiguous_nats + state.settings.form_error_share * own_nats
-    return others if free - own_nats > allowed else []
+    return others if free - own_nats > state.settings.allow_form_error(own_nats) else []
 
 
 def _any_spectrum(component: Component, state: State) -> Candidate:

@@ -181,7 +181,7 @@ class DelaySearch:
         return np.array(
             [
                 max(
-                    map(sum_evidence, group_components(of_shift, settings=settings).values()),
+                    map(sum_evidence, group_components(of_shift, settings).values()),
                     default=0.0,
                 )
                 for of_shift in grouped

@@ -62,8 +62,7 @@ class SearchRound:
             key
             for key in passing
             if not is_nuisance(key)
-            and self.nats(key)
-            >= ambiguous_evidence(self.components[key][:1], best, settings=settings)
+            and self.nats(key) >= ambiguous_evidence(self.components[key][:1], best, settings)
         ]
         effects = {self.components[key][0].candidate.effect for key in rivals}
         is_later = {
@@ -255,7 +254,7 @@ class SearchRound:
         sought = [candidate for candidate in examination.candidates if candidate.key in keys]
         companions = {}
         for other, other_components in examination.find_components(sought, with_first).items():
-            error = form_error(other_components, chosen, settings=examination.settings)
+            error = form_error(other_components, chosen, examination.settings)
             physical, _ = keep_physical(other_components, with_first, error=error)
             if sum_evidence(physical) > examination.threshold + error:
                 companions[other] = physical

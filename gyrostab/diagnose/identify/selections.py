@@ -9,7 +9,7 @@ from gyrostab.diagnose.identify.components import are_lines, axes_of, sum_eviden
 from gyrostab.diagnose.predict.candidates import Component, is_nuisance
 from gyrostab.diagnose.predict.condition import condition_on_components, refit_powers
 from gyrostab.diagnose.predict.linear_model import State
-from gyrostab.diagnose.settings import DEFAULTS, Settings
+from gyrostab.diagnose.settings import Settings
 
 #: What filters the noise of the log, and would explain an error in the spectrum of another effect.
 _FILTER = "logger_filter"
@@ -93,8 +93,7 @@ def add_selection(chosen: Sequence[Selection], addition: Selection) -> list[Sele
 def with_axes_of(
     identification: Selection,
     components_by_key: Mapping[str, Sequence[Component]],
-    *,
-    settings: Settings = DEFAULTS,
+    settings: Settings,
 ) -> Selection:
     """Return an identification without the axes on which it adds no evidence.
 
@@ -161,7 +160,7 @@ def make_selection(
 
 
 def own_form_error(
-    components: Sequence[Component], evidence_nats: float, *, settings: Settings = DEFAULTS
+    components: Sequence[Component], evidence_nats: float, settings: Settings
 ) -> float:
     """Return what an error of its form may cost an effect with this evidence [nats].
 
@@ -173,15 +172,15 @@ def own_form_error(
 
 
 def ambiguous_evidence(
-    components: Sequence[Component], evidence_nats: float, *, settings: Settings = DEFAULTS
+    components: Sequence[Component], evidence_nats: float, settings: Settings
 ) -> float:
     """Return the least evidence of an alternative to an effect with this evidence [nats]."""
-    error = own_form_error(components, evidence_nats, settings=settings)
+    error = own_form_error(components, evidence_nats, settings)
     return evidence_nats - settings.ambiguous_nats - error
 
 
 def form_error(
-    components: Sequence[Component], chosen: Sequence[Selection], *, settings: Settings = DEFAULTS
+    components: Sequence[Component], chosen: Sequence[Selection], settings: Settings
 ) -> float:
     """Return what errors of the form of other effects may leave to these components [nats].
 
@@ -195,21 +194,18 @@ def form_error(
     for selection in chosen:
         for component in selection.components:
             statistic = component.statistic
-            affected_candidates = [
+            affected = [
                 own.candidate
                 for own in components
                 if not own.statistic.is_line
                 and own.statistic.name in (statistic.name, *statistic.error_shows_in)
                 and {*own.row} & {*component.row}
             ]
-            is_spectral = (
-                statistic.is_power
-                and bool(selection.driver)
-                and any(
-                    candidate.effect == _FILTER or candidate.driver == selection.driver
-                    for candidate in affected_candidates
-                )
+            is_spectral = any(
+                candidate.effect == _FILTER or candidate.driver == selection.driver
+                for candidate in affected
+                if statistic.is_power and selection.driver
             )
             share = settings.spectrum_error_share if is_spectral else settings.form_error_share
-            error += share * component.evidence_nats if affected_candidates else 0.0
+            error += share * component.evidence_nats if affected else 0.0
     return error

@@ -47,7 +47,7 @@ def prune_selections(examination: Examination, chosen: list[Selection]) -> list[
         )
         best = max(map(sum_evidence, components_by_key.values()), default=0.0)
         if selection.is_named:
-            reduced = with_axes_of(selection, components_by_key, settings=examination.settings)
+            reduced = with_axes_of(selection, components_by_key, examination.settings)
             chosen = [reduced if other is selection else other for other in chosen]
         elif best < examination.threshold:
             chosen = [other for other in chosen if other is not selection]
@@ -89,9 +89,7 @@ def _finish_identification(
     )
     evidence_nats = sum(max(sum_evidence(layer), 0.0) for layer in layers)
     instead = sum_by_key(on_axes)
-    min_nats = ambiguous_evidence(
-        identification.components, evidence_nats, settings=examination.settings
-    )
+    min_nats = ambiguous_evidence(identification.components, evidence_nats, examination.settings)
     rivals = [
         on_axes[other][0].candidate.effect
         for other, nats in instead.items()

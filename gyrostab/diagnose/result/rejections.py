@@ -64,7 +64,7 @@ def find_rejections(identifications: Identifications) -> list[Rejection]:
     """
     examination, state = identifications.examination, identifications.state
     all_evidence = score_candidates(examination, state, ())
-    components = merge_lines(group_components(all_evidence, settings=examination.settings))
+    components = merge_lines(group_components(all_evidence, examination.settings))
     settled = [*identifications.identified, *identifications.unidentified]
     chosen = [*identifications.identified]
     for selection in identifications.unidentified:

@@ -95,7 +95,7 @@ def name_probability(identification: Selection, *, settings: Settings = DEFAULTS
         )
         for name in identification.alternatives
     ]
-    error = own_form_error(identification.components, evidence_nats, settings=settings)
+    error = own_form_error(identification.components, evidence_nats, settings)
     ahead_nats = np.array(other_nats) - evidence_nats
     ahead_nats -= np.clip(ahead_nats, -error, error)
     # E_k - E may be any number of nats.

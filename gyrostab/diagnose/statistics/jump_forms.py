@@ -50,7 +50,7 @@ def jump_competitors(
         return
     settings = state.settings
     evidence = sum(max(component.evidence_nats, 0.0) for component in jumps)
-    allowed = settings.ambiguous_nats + settings.form_error_share * evidence
+    allowed = settings.allow_form_error(evidence)
     step = sum(component_mixture(jump, state).evidence for jump in jumps)
     block = float(state.blocks.attrs["block_s"])
     middle = (np.arange(state.blocks.sizes["block"]) + 0.5) * block
@@ -109,7 +109,7 @@ def restart_competitors(component: Component, state: State) -> Iterator[Competit
     middle = np.arange(block_count) + 0.5
     courses = np.clip((middle - edges[:-1, None]) / np.diff(edges)[:, None], 0.0, 1.0)
     gradual = component_mixture(component, state, _with_course(component, *courses)).evidence
-    allowed = settings.ambiguous_nats + settings.form_error_share * component.evidence_nats
+    allowed = settings.allow_form_error(component.evidence_nats)
     yield Competitor("a gradual change", gradual - at_restarts, allowed)
 
     changes = np.diff(steps, prepend=0.0)

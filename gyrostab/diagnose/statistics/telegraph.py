@@ -67,8 +67,7 @@ class TelegraphStatistic(BlockMeanStatistic):
 
     def axis_competitors(self, component: Component, state: State) -> Iterator[Competitor]:
         """Yield three levels or more: a bias that still switches with two in the model."""
-        axis, settings = component.row[0], state.settings
-        allowed = settings.ambiguous_nats + settings.form_error_share * component.evidence_nats
+        axis, allowed = component.row[0], state.settings.allow_form_error(component.evidence_nats)
         if component.variant.inside.size:
             within = _search_sub_blocks(state.blocks, _add_fast_switching(state, component), axis)
             nats = (

@@ -22,6 +22,7 @@ from gyrostab.diagnose.predict.filter_response import undo_filter
 from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.diagnose.statistics.spectral_line import estimate_line
@@ -271,8 +272,10 @@ def test_a_steady_line_has_no_model_error() -> None:
         identification(component("spectral_line", "spectral_line", 900.0, 3)),
         identification(component("shupe", "mean", 400.0)),
     ]
-    assert form_error([component("spectral_line", "spectral_line", 20.0, 9)], chosen) == 0.0
-    assert form_error([component("warm_up", "mean", 20.0)], chosen) == pytest.approx(4.0)
+    assert (
+        form_error([component("spectral_line", "spectral_line", 20.0, 9)], chosen, DEFAULTS) == 0.0
+    )
+    assert form_error([component("warm_up", "mean", 20.0)], chosen, DEFAULTS) == pytest.approx(4.0)
 
 
 def test_driven_noise_may_leave_a_filter_or_noise_of_its_channel_but_no_other_noise() -> None:
@@ -285,10 +288,12 @@ def test_driven_noise_may_leave_a_filter_or_noise_of_its_channel_but_no_other_no
         (driven, "temperature_noise", 2.0),
         (steady, "logger_filter", 2.0),
     ):
-        assert form_error([component(effect, "power", 17.0)], [chosen]) == pytest.approx(error)
+        assert form_error([component(effect, "power", 17.0)], [chosen], DEFAULTS) == pytest.approx(
+            error
+        )
     left = component("aliased_vibration", "power", 17.0)
     left = replace(left, candidate=replace(left.candidate, driver=driven.driver))
-    assert form_error([left], [driven]) == pytest.approx(20.0)
+    assert form_error([left], [driven], DEFAULTS) == pytest.approx(20.0)
 
 
 @pytest.mark.parametrize("weight", [0.1, 0.25, 0.5])

@@ -11,6 +11,7 @@ from gyrostab.diagnose.identify.selections import Selection, with_axes_of
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Candidate, Component, Variant
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
+from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics import find_statistic
 from gyrostab.simulate import simulate
 from tests.support import named
@@ -63,15 +64,17 @@ def test_identification_keeps_axes_that_still_show_it():
     components = (component(9.0), component(8.0, row="y"))
     identification = Selection("misalignment", (), ("x", "y"), components, 15.5, 8.0)
     key = components[0].candidate.key
-    assert with_axes_of(identification, {key: [component(9.0), component(1.0, row="y")]}).axes == (
-        "x",
-    )
+    assert with_axes_of(
+        identification, {key: [component(9.0), component(1.0, row="y")]}, DEFAULTS
+    ).axes == ("x",)
     assert (
-        with_axes_of(identification, {key: [component(9.0), component(1.0, row="y")]}).components
+        with_axes_of(
+            identification, {key: [component(9.0), component(1.0, row="y")]}, DEFAULTS
+        ).components
         == components[:1]
     )
     for others in ({key: [component(3.0), component(4.0, row="y")]}, {}):  # NaN is not equal to NaN
-        assert repr(with_axes_of(identification, others)) == repr(identification)
+        assert repr(with_axes_of(identification, others, DEFAULTS)) == repr(identification)
 
 
 @pytest.mark.full

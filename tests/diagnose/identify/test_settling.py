@@ -199,7 +199,7 @@ def test_alternatives_may_lack_what_an_error_of_the_form_costs(statistic, least)
     variant = Variant({}, ("size",), np.ones((1, 1, BLOCKS)))
     candidate = Candidate("shupe", find_statistic(statistic), ("temperature",), (variant,))
     component = Component(candidate, variant, ("x",), 2000.0)
-    assert ambiguous_evidence([component], 2000.0) == pytest.approx(least)
+    assert ambiguous_evidence([component], 2000.0, DEFAULTS) == pytest.approx(least)
 
 
 def test_alternatives_of_a_strong_effect_are_listed_within_the_error_of_its_form():
