@@ -71,14 +71,10 @@ def _select_all(examination: Examination) -> tuple[list[Selection], dict[str, tu
     """
     chosen: list[Selection] = []
     state = examination.start
-    barred = {
-        key
-        for identification in examination.expected
-        for key in (
-            identification.components[0].candidate.key,
-            *_explained_count_keys(examination, identification),
-        )
-    }
+    barred: set[str] = set()
+    for identification in examination.expected:
+        barred.add(identification.components[0].candidate.key)
+        barred |= _explained_count_keys(examination, identification)
     effects_left, lines_left = MAX_EFFECTS, MAX_LINES
     beaten: dict[str, tuple[str, float]] = {}
     includes_last_resorts = False
@@ -98,11 +94,10 @@ def _select_all(examination: Examination) -> tuple[list[Selection], dict[str, tu
             break
         includes_last_resorts = False
         for selection in selections:
-            if are_lines(selection.components):
-                lines_left -= 1
-                barred |= set() if lines_left > 0 else {PLAIN_LINE}
-            else:
-                effects_left -= 1
+            is_line = are_lines(selection.components)
+            lines_left, effects_left = lines_left - is_line, effects_left - (not is_line)
+            if lines_left == 0:
+                barred.add(PLAIN_LINE)
             chosen = add_selection(chosen, selection)
             barred |= _explained_count_keys(examination, selection)
             state = condition_on(state, selection.components)
@@ -119,8 +114,7 @@ def _explained_count_keys(examination: Examination, selection: Selection) -> set
         return {"~outliers"}  # the kurtosis of a block is that of other noise
     if not any(component.statistic.is_count for component in components):
         return set()
-    counts = {name for component in components for name in component.variant.columns}
-    counts |= {"kurtosis"}
+    counts = {"kurtosis", *(name for part in components for name in part.variant.columns)}
     counts |= _ZERO_COUNTS if counts & _ZERO_COUNTS else set()
     return {
         candidate.key
@@ -267,8 +261,8 @@ def identify_expected_effects(examination: Examination) -> Examination:
         identified.append(make_selection(components, needed, order=state.axes))
         state = condition_on(state, components)
         # counts of anomalous samples cannot be taken out
-        ended = effect if components[0].statistic.is_count else None
-        remaining = [other for _, other in choices if other is not ended]
+        is_over = components[0].statistic.is_count
+        remaining = [other for _, other in choices if not (is_over and other is effect)]
     return replace(examination, expected=tuple(identified), start=state)
 
 
