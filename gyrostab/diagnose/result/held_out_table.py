@@ -69,12 +69,11 @@ def measure_held_out(
     anomalous = components_of([*identified, *with_course.expected])
     clean = mask_anomalous_blocks(blocks, anomalous, settings)
     responses = cache(partial(logger_responses, blocks))
-
-    @_remember_fits
-    def calibrate(training: Bools) -> xr.Dataset:
-        return calibrate_on_training_blocks(
-            blocks, baseline, training, responses=responses, settings=settings
+    calibrate = _remember_fits(
+        partial(
+            calibrate_on_training_blocks, blocks, baseline, responses=responses, settings=settings
         )
+    )
 
     @_remember_fits
     def before(training: Bools) -> xr.Dataset:
