@@ -232,7 +232,7 @@ def _begin_round(
         else:
             beaten.pop(key, None)
             required[key] = examination.required_nats(components[key], chosen)
-    return SearchRound(examination, state, components, required)
+    return SearchRound(examination, state, components, required, chosen)
 
 
 def _sum_rows(evidence: CandidateEvidence) -> float:

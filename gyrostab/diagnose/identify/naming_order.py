@@ -12,7 +12,7 @@ import numpy as np
 from gyrostab.diagnose.identify.components import sum_evidence
 from gyrostab.diagnose.identify.examination import Examination
 from gyrostab.diagnose.identify.identifiability import find_plainer_effect, keep_physical
-from gyrostab.diagnose.identify.selections import ambiguous_evidence, form_error, make_selection
+from gyrostab.diagnose.identify.selections import Selection, ambiguous_evidence, make_selection
 from gyrostab.diagnose.predict.candidates import Component, is_nuisance
 from gyrostab.diagnose.predict.condition import condition_on, mean_columns
 from gyrostab.diagnose.predict.linear_model import State
@@ -26,6 +26,7 @@ class SearchRound:
     state: State
     components: dict[str, list[Component]]  # by key of the candidate, the strongest first
     required: dict[str, float]  # evidence that each of them needs [nats]
+    chosen: Sequence[Selection] = ()  # so far
 
     def nats(self, key: str) -> float:
         """Return the evidence of an effect or alternative [nats]."""
@@ -249,14 +250,15 @@ class SearchRound:
     ) -> tuple[State, dict[str, list[Component]]]:
         """Return the state with these components of an effect, and what passes with them in it."""
         examination = self.examination
-        chosen = [make_selection(components, self.required[key])]
+        chosen = [*self.chosen, make_selection(components, self.required[key])]
         with_first = condition_on(self.state, components)
         sought = [candidate for candidate in examination.candidates if candidate.key in keys]
         companions = {}
         for other, other_components in examination.find_components(sought, with_first).items():
-            error = form_error(other_components, chosen, examination.settings)
+            required = examination.required_nats(other_components, chosen)
+            error = required - examination.threshold
             physical, _ = keep_physical(other_components, with_first, error=error)
-            if sum_evidence(physical) > examination.threshold + error:
+            if sum_evidence(physical) > required:
                 companions[other] = physical
         return with_first, companions
 

@@ -33,24 +33,25 @@ from gyrostab.diagnose.predict.linear_model import State
 
 
 def prune_selections(examination: Examination, chosen: list[Selection]) -> list[Selection]:
-    """Drop what is unidentified and fails the threshold with the others in the model.
+    """Drop what is unidentified and lacks the evidence that it needs with the others in the model.
 
     The weakest is tested first. Then identifications lose the axes that no longer show them.
     """
     for selection in sorted(
         chosen, key=lambda selection: (selection.is_named, selection.evidence_nats)
     ):
-        if len(chosen) < 2:
+        others = [other for other in chosen if other is not selection]
+        if not others:
             break
         components_by_key = examination.find_components(
-            candidates_of(selection.components), examination.state_with(chosen, without=selection)
+            candidates_of(selection.components), examination.state_with(others)
         )
         best = max(map(sum_evidence, components_by_key.values()), default=0.0)
         if selection.is_named:
             reduced = with_axes_of(selection, components_by_key, examination.settings)
             chosen = [reduced if other is selection else other for other in chosen]
-        elif best < examination.threshold:
-            chosen = [other for other in chosen if other is not selection]
+        elif best < examination.required_nats(selection.components, others):
+            chosen = others
     return chosen
 
 

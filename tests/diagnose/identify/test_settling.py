@@ -10,7 +10,7 @@ import pytest
 
 from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
-from gyrostab.diagnose.identify import forward_search
+from gyrostab.diagnose.identify import forward_search, naming_order
 from gyrostab.diagnose.identify.examination import Examination, nuisance_alternatives
 from gyrostab.diagnose.identify.selections import (
     Selection,
@@ -215,6 +215,49 @@ def test_alternatives_of_a_strong_effect_are_listed_within_the_error_of_its_form
     rival = max(nats for key, nats in settled.instead.items() if "supply" in key)
     assert 3.0 < settled.evidence_nats - rival < 3.0 + 0.01 * settled.evidence_nats
     assert settled.alternatives == ("supply_bias",)
+
+
+@pytest.mark.parametrize(("left", "remains"), [(17.0, False), (19.0, True)])
+def test_what_an_error_of_a_form_may_leave_is_not_unidentified(left, remains):
+    """1 % of the 1000 nats of an effect, in addition to the threshold of 8 nats."""
+    strong = make_selection(_explain("temperature_bias", "mean", {"x": 1000.0}), 8.0)
+    drift = make_selection(_explain("~bias(t)", "mean", {"x": 50.0}), 8.0)
+
+    class WithOthers(Examination):
+        def state_with(self, selections):
+            return None
+
+        def find_components(self, candidates, state):
+            (candidate,) = candidates
+            nats = left if candidate.effect == "~bias(t)" else 1000.0
+            return {candidate.key: _explain(candidate.effect, "mean", {"x": nats})}
+
+    examination = WithOthers((), CountEvidence({}), 8.0, SimpleNamespace(settings=DEFAULTS))
+    pruned = prune_selections(examination, [strong, drift])
+    assert (drift in pruned) is remains
+
+
+@pytest.mark.parametrize(("nats", "passes"), [(17.0, False), (19.0, True)])
+def test_the_second_of_a_pair_needs_what_earlier_effects_may_leave(monkeypatch, nats, passes):
+    """1 % of the 1000 nats of an effect named before, in addition to the threshold of 8 nats."""
+    monkeypatch.setattr(naming_order, "condition_on", lambda state, components: state)
+    monkeypatch.setattr(
+        naming_order, "keep_physical", lambda components, state, error: (components, None)
+    )
+    earlier = make_selection(_explain("temperature_bias", "mean", {"x": 1000.0}), 8.0)
+    first = _explain("bias_jump", "mean", {"y": 30.0})
+    second = _explain("shupe", "mean", {"x": nats})
+
+    class OfPair(Examination):
+        def find_components(self, candidates, state):
+            return {"shupe": second}
+
+    examination = OfPair((), CountEvidence({}), 8.0, SimpleNamespace(settings=DEFAULTS))
+    search = naming_order.SearchRound(
+        examination, None, {"bias_jump": first}, {"bias_jump": 8.0}, [earlier]
+    )
+    _, companions = search._find_companions(["shupe"], "bias_jump", first)
+    assert ("shupe" in companions) is passes
 
 
 def test_spikes_of_a_comb_of_lines_are_not_identified(monkeypatch):
