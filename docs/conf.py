@@ -30,6 +30,7 @@ nb_merge_streams = True
 # API reference
 autosummary_generate = True
 autodoc_typehints = "none"
+autodoc_preserve_defaults = True
 napoleon_google_docstring = False
 napoleon_use_param = False
 napoleon_use_rtype = False

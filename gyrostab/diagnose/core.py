@@ -100,8 +100,8 @@ def diagnose(
         Shortest gap that counts as a power-off [s].
     progress : Stage
         Callback for progress.
-    settings : Settings
-        Numbers that decide what is reported; docs/settings.md lists them with their sources.
+    settings : gyrostab.diagnose.settings.Settings
+        Numbers that decide what is reported, each with its source.
 
     Returns
     -------

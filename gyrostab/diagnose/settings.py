@@ -21,7 +21,7 @@ def _make_setting(value: float, unit: str, meaning: str, source: str) -> Any:
     return field(default=value, metadata={"unit": unit, "meaning": meaning, "source": source})
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Settings:
     """Numbers that decide what a diagnosis reports.
 
@@ -36,8 +36,8 @@ class Settings:
     Examples
     --------
     >>> strict = Settings(ambiguous_nats=4.6)  # odds of 100 to 1
-    >>> strict.ambiguous_nats, strict.reject_nats
-    (4.6, 9.2)
+    >>> strict, strict.reject_nats
+    (Settings(ambiguous_nats=4.6), 9.2)
     """
 
     majority_share: float = _make_setting(
@@ -121,7 +121,7 @@ class Settings:
         0.05,
         "1",
         "Share of a channel and its time-shifted surrogates that may explain as much as it.",
-        "usual level of a test; the least that 20 surrogates can show is 1 / 21",
+        "usual level of a test",
     )
     term_correlation: float = _make_setting(
         0.999,
@@ -158,12 +158,6 @@ class Settings:
         "threshold",
         "Evidence of the strongest power, from which all powers are weighted with it.",
         "choice: an effect of three thresholds raises some powers several times",
-    )
-    min_surrogates: int = _make_setting(
-        20,
-        "surrogate",
-        "Time-shifted surrogates without which a channel is not tested.",
-        "the least round number that can show a share of 5 %",
     )
     min_comb_lines: int = _make_setting(
         3, "1", "Lines that may be one comb.", "two lines define a spacing; the third tests it"
@@ -426,6 +420,22 @@ class Settings:
             value = getattr(self, item.name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{item.name}={value!r}: give a number from 0 up")
+
+    def __repr__(self) -> str:
+        changed = {
+            item.name: value
+            for item in fields(self)
+            if (value := getattr(self, item.name)) != item.default
+        }
+        return f"Settings({', '.join(f'{name}={value!r}' for name, value in changed.items())})"
+
+    @property
+    def min_surrogates(self) -> int:
+        """Time-shifted surrogates without which a channel is not tested.
+
+        Fewer cannot show that the channel is among the `surrogate_share` that explain most.
+        """
+        return math.ceil(1.0 / self.surrogate_share) if self.surrogate_share else 1
 
     @property
     def score_error_share(self) -> float:
