@@ -10,6 +10,7 @@ project = "gyrostab"
 author = "The gyrostab developers"
 release = gyrostab.__version__
 root_doc = "index"
+default_role = "py:obj"  # names in docstrings become links
 
 extensions = [
     "myst_nb",
@@ -29,8 +30,10 @@ nb_merge_streams = True
 
 # API reference
 autosummary_generate = True
+templates_path = ["_templates"]
 autodoc_typehints = "none"
 autodoc_preserve_defaults = True
+toc_object_entries_show_parents = "hide"
 napoleon_google_docstring = False
 napoleon_use_param = False
 napoleon_use_rtype = False
@@ -50,9 +53,14 @@ html_theme_options = {
     "secondary_sidebar_items": ["page-toc"],
 }
 
-# Command line reference, from the help texts; asterisks in examples are literal.
+# Command line reference, from the help texts, in the order of the help; asterisks in examples are
+# literal.
 commands = app.generate_docs(output_format="rst").replace(" -m sphinx ", " ")
 commands = re.sub(r"^Example: (.*?) *$", r"Example: ``\1``", commands, flags=re.MULTILINE)
+commands = re.sub(r"^\.\. contents::.*\n(   .*\n)*", "", commands, flags=re.MULTILINE)
+head, *sections = re.split(r"^(?=\.\. _cyclopts-gyrostab-)", commands, flags=re.MULTILINE)
+order = re.findall(r"^``-*([\w-]+)``$", head, flags=re.MULTILINE)
+sections.sort(key=lambda section: order.index(section.split(":")[0].split("gyrostab-")[1]))
 Path(__file__).with_name("reference").joinpath("commands.rst").write_text(
-    commands, encoding="utf-8"
+    "\n\n".join(part.rstrip() for part in (head, *sections)), encoding="utf-8"
 )
