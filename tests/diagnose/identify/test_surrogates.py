@@ -18,7 +18,7 @@ from gyrostab.diagnose.predict.linear_model import initial_state
 from gyrostab.diagnose.predict.search import compute_evidence
 from gyrostab.diagnose.predict.windows import rebuild_variant
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
-from gyrostab.diagnose.settings import Settings
+from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.ingest.make_log import make_log
 from gyrostab.simulate import simulate
@@ -26,7 +26,9 @@ from tests.support.candidates import find_components, select_candidate
 from tests.support.noise_records import flicker, mixture
 
 
-def _run_time_shift_test(sensitivity: float, period: float) -> tuple[bool, float]:
+def _run_time_shift_test(
+    sensitivity: float, period: float, settings: Settings = DEFAULTS
+) -> tuple[bool, float, float]:
     """Test a bias that follows a temperature with this period [s]."""
     swing = [
         [t, 40.0 + 20.0 * np.sin(2.0 * np.pi * t / period)]
@@ -52,7 +54,7 @@ def _run_time_shift_test(sensitivity: float, period: float) -> tuple[bool, float
     variant = next(variant for variant in candidate.variants if variant.columns == ("sensitivity",))
     return passes_time_shift_test(
         [Component(candidate, variant, ("x",), 50.0)],
-        initial_state(blocks, baseline),
+        initial_state(blocks, baseline, settings=settings),
     )
 
 
@@ -68,6 +70,15 @@ def test_unrelated_channel_fails():
     beats, p_value, _ = _run_time_shift_test(0.0, 1300.0)
     assert not beats
     assert p_value > 0.05
+
+
+def test_a_channel_with_too_few_surrogates_is_not_tested():
+    """A share of 0.5 % needs 200; the 90 blocks of the record give 89."""
+    settings = Settings(surrogate_share=0.005)
+    assert settings.min_surrogates == 200
+    beats, p_value, _ = _run_time_shift_test(0.0, 1300.0, settings)
+    assert beats
+    assert np.isnan(p_value)
 
 
 @pytest.mark.full
