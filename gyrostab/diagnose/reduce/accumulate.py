@@ -37,9 +37,8 @@ LAGGED_CHANNEL_PREFIXES = ("temperature", "supply_voltage", "light_power")
 #: Sub-blocks of a block over which the axes are averaged. Design choice: fast switching.
 SUB_BLOCKS = 16
 _MIN_SPECTRUM_SHARE = 0.25  # of a block that must be present for its spectrum; design choice
-# Samples of a frame that was sent twice. In a block of 8000 samples of 2^16 equally likely values,
-# chance repeats as many in their order with a probability of 8000^2 / 2 / 2^48 = 1e-7.
-_MIN_RESENT = 3
+#: Samples that a frame which was sent twice has at least; chance repeats fewer on a coarse grid.
+RESENT_LENGTHS = (3, 6, 12)
 _GRID_BLOCKS = 64  # blocks of which samples are kept for the quantization grid; limits memory
 _GRID_SAMPLES_PER_AXIS = 2**16  # limits memory
 
@@ -122,7 +121,7 @@ class Accumulator:
         centred = np.empty_like(values)
         moments = np.full((self.row_count, count, moments_kernel.MOMENTS), np.nan)
         counts = np.zeros((self.row_count, count, moments_kernel.COUNTS), np.int64)
-        resent = np.zeros((axes, count, 2), np.int64)
+        resent = np.zeros((axes, count, len(RESENT_LENGTHS), 2), np.int64)
         histogram = np.zeros((axes, count, HISTOGRAM), np.uint32)
         for row in range(self.row_count):
             moments_kernel.measure_samples(values[row], centred[row], moments[row], counts[row])
@@ -131,7 +130,7 @@ class Accumulator:
             self.peaks[row].append(peaks._replace(block=peaks.block + batch.first))
             is_sent = present[row] & (values[row] != 0.0)
             bits = np.where(is_sent, values[row].view(np.int64), 0)
-            moments_kernel.count_resent(bits, _MIN_RESENT, resent[row])
+            moments_kernel.count_resent(bits, RESENT_LENGTHS, resent[row])
         sub_blocks = [_average_parts(axis_values, SUB_BLOCKS) for axis_values in values[:axes]]
         by_name: dict[str, Array] = {
             "moments": moments,

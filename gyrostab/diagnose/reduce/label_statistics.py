@@ -13,10 +13,12 @@ from gyrostab.diagnose.reduce.accumulate import (
     CHANNEL_PARTS,
     LAGGED_CHANNEL_PREFIXES,
     RAMP_PHASE_BINS,
+    RESENT_LENGTHS,
     Accumulator,
 )
 from gyrostab.diagnose.reduce.log_blocks import channel_means, is_rms_channel, numeric_channels
 from gyrostab.diagnose.reduce.outliers import (
+    NORMAL_MEDIAN_ABS,
     count_histogram_outliers,
     quantization_step,
     zeros_beyond_chance,
@@ -47,6 +49,7 @@ from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
 _MAX_SMOOTHING_BLOCKS = 2.0  # longest time scale of the smoothing of a channel; design choice
 _STEP_VALUES_PER_BLOCK = 256  # values from which the quantization step is found; limits time
+_MAX_CHANCE_RUNS = 1e-3  # of repeated samples in a record, as its share of false alarms is 1 %
 MIN_MEAN_SHARE = 0.1  # of a block that must be present for its mean; design choice
 _MIN_GAP_S = 1.0  # shorter gaps are not listed; design choice
 #: Variables that are taken unchanged from the batches.
@@ -107,8 +110,12 @@ def _count_anomalous_samples(work: Accumulator, by_name: Mapping[str, Array]) ->
     steps = np.array(
         [quantization_step(first.ravel()) for first in samples[..., :_STEP_VALUES_PER_BLOCK]]
     )
-    # on a quantization grid equal values are frequent by chance
-    resent = np.where(steps[:, None, None] > 0.0, 0, by_name["resent"])
+    resent = np.stack(
+        [
+            _resent_samples(*of_axis, length=work.length)
+            for of_axis in zip(by_name["resent"], samples, steps.tolist(), strict=True)
+        ]
+    )
     samples = samples.reshape(work.axis_count, -1)
     widths = np.array([*map(bin_widths, samples, steps)])
     centres, per_repeat = np.transpose([*map(sticking_value, samples, steps)])
@@ -186,6 +193,26 @@ def _record_range(moments: Floats) -> tuple[Floats, Floats]:
     """Return the smallest and largest value of every axis, (axis, 1)."""
     lowest = np.fmin.reduce(moments[..., LOWEST], axis=1, keepdims=True)
     return lowest, np.fmax.reduce(moments[..., HIGHEST], axis=1, keepdims=True)
+
+
+def _resent_samples(counts: Ints, samples: Floats, step: float, *, length: int) -> Ints:
+    """Return samples and runs of each block (block, 2) that repeat earlier ones, not by chance.
+
+    They are those of the first of `RESENT_LENGTHS` k of which chance makes hardly any in the
+    record, with `counts` (block, length, 2). On a quantization grid, a sample is equal to one that
+    is some distance before with a probability of at most ``p = step / (sqrt(2 pi) sd)``, sd being
+    the standard deviation of the difference of neighbours, as farther samples differ by more. In n
+    samples, in blocks of b, chance begins at most ``n b p`` runs and at most n, and continues a
+    share ``p^(k - 1)`` of them.
+    """
+    difference = np.abs(np.diff(samples, axis=-1))
+    difference = difference[np.isfinite(difference)]
+    sd = float(np.median(difference)) / NORMAL_MEDIAN_ABS if difference.size else 0.0
+    chance = step / (np.sqrt(2.0 * np.pi) * sd) if sd > 0.0 else 1.0
+    samples_in_all = len(counts) * length
+    begun = samples_in_all * min(length * chance, 1.0)
+    is_rare = begun * chance ** (np.array(RESENT_LENGTHS) - 1.0) < _MAX_CHANCE_RUNS
+    return counts[:, int(is_rare.argmax())] if is_rare.any() else np.zeros_like(counts[:, 0])
 
 
 def _count_at_range_ends(moments: Floats, counts: Ints) -> Ints:

@@ -25,7 +25,7 @@ _STEP_ERROR_SHARE = 1e-3  # of the step, from rounding errors of the values; des
 _SPIKE_SHARE = 0.1  # of the values, where spikes may be as common as grid values; design choice
 _NEIGHBOUR_BLOCKS = 2  # on either side, that enter the deviation of a block; design choice
 _NOISIER_NEIGHBOUR_RATIO = 1.5  # of deviations, from which a noisier neighbour counts
-_NORMAL_MEDIAN_ABS = 0.6745  # median of |x| of a standard normal variable
+NORMAL_MEDIAN_ABS = 0.6745  # median of |x| of a standard normal variable
 
 
 class Peaks(NamedTuple):
@@ -165,7 +165,7 @@ def _deviation_from_median(histogram: Ints) -> Floats:
     below = np.take_along_axis(total, number[..., None], axis=-1)[..., 0] - inside
     share = np.divide(half - below, inside, out=np.ones(half.shape), where=inside > 0)
     return np.asarray(
-        np.where(total[..., -1] > 0, histogram_edge(number + 1 + share) / _NORMAL_MEDIAN_ABS, 0.0)
+        np.where(total[..., -1] > 0, histogram_edge(number + 1 + share) / NORMAL_MEDIAN_ABS, 0.0)
     )
 
 

@@ -91,19 +91,19 @@ def measure_samples(x, centred, moments, counts):  # type: ignore[no-untyped-def
 
 
 @njit(**KERNEL)
-def count_resent(bits, min_length, out):  # type: ignore[no-untyped-def]
+def count_resent(bits, min_lengths, out):  # type: ignore[no-untyped-def]
     """Count the samples of each block that repeat earlier ones in their order.
 
     Such samples belong to a run in which each equals the one at the same distance before, at least
-    two samples away. A value equal to the one right before it is in no run.
+    two samples away. A value equal to the one right before it begins no run.
 
     Parameters
     ----------
     bits : ndarray of int64, shape (block, sample)
         Values as bit patterns; 0 where missing or exactly zero.
-    min_length : int
+    min_lengths : sequence of int
         Samples that a run has at least.
-    out : ndarray of int64, shape (block, 2)
+    out : ndarray of int64, shape (block, min_length, 2)
         Overwritten with the samples in runs, and the runs.
     """
     size = bits.shape[1]
@@ -114,26 +114,26 @@ def count_resent(bits, min_length, out):  # type: ignore[no-untyped-def]
     for b in range(bits.shape[0]):
         row = bits[b]
         table[:] = -1
-        samples, runs, length, lag = 0, 0, 0, 0
+        out[b] = 0
+        length, lag = 0, 0
         for i in range(size):
             value = row[i]
             slot = (value ^ (value >> 23) ^ (value >> 41)) & mask
             while table[slot] >= 0 and row[table[slot]] != value:
                 slot = (slot + 1) & mask
             earlier = table[slot]
-            is_new = value == 0 or earlier < 0 or earlier == i - 1
             if value != 0:
                 table[slot] = i
-            goes_on = not is_new and length > 0 and row[i - lag] == value
-            if not goes_on:
-                length, lag = 0, i - earlier
-            length = 0 if is_new else length + 1
-            if length == min_length:
-                samples += min_length
-                runs += 1
-            elif length > min_length:
-                samples += 1
-        out[b, 0], out[b, 1] = samples, runs
+            if length > 0 and value != 0 and row[i - lag] == value:
+                length += 1
+            else:
+                length, lag = int(value != 0 and 0 <= earlier < i - 1), i - earlier
+            for place, min_length in enumerate(min_lengths):
+                if length == min_length:
+                    out[b, place, 0] += min_length
+                    out[b, place, 1] += 1
+                elif length > min_length:
+                    out[b, place, 0] += 1
 
 
 @njit(**KERNEL)

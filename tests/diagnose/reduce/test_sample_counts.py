@@ -63,6 +63,28 @@ def test_samples_at_one_rate_are_stuck_and_held_ones_are_not(step):
     assert int(blocks.stuck[1].sum()) == 0
 
 
+@pytest.mark.parametrize(
+    ("step", "length"), [(0.0, 3), (1e-6, 3), (1e-3, 8), (0.01, 8), (0.03, 20), (0.1, 20)]
+)
+def test_frames_sent_twice_are_counted_unless_chance_repeats_as_many(step: float, length: int):
+    x = np.random.default_rng(10).standard_normal((2, 60_000))
+    if step:
+        x = step * (np.floor(x / step) + 0.5)  # never zero
+    assert int(reduce_log(log_of(x), block="10s").resent.sum()) == 0
+    starts = np.arange(500, 60_000, 1000)
+    for start in starts:
+        x[:, start : start + length] = x[:, start - length : start]
+    marked = reduce_log(log_of(x), block="10s")
+    # a value that occurs in between by chance may hide the beginning of a frame
+    np.testing.assert_allclose(marked.resent.sum("block"), starts.size * length, rtol=0.1)
+
+
+@pytest.mark.parametrize("step", [0.3, 1.0, 3.0])
+def test_coarse_values_are_no_frames_sent_twice(step: float):
+    x = np.random.default_rng(11).standard_normal((1, 60_000))
+    assert int(reduce_log(log_of(step * (np.floor(x / step) + 0.5)), block="10s").resent.sum()) == 0
+
+
 def test_zeros_of_one_axis_are_stuck_and_common_zeros_are_filled():
     rng = np.random.default_rng(10)
     x = rng.standard_normal((3, 60 * 1000))
