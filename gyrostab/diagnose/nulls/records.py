@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from scipy.stats import trim_mean
 
 from gyrostab.arrays import Complexes, Floats
 from gyrostab.diagnose.baseline.expected_statistics import line_columns, sum_noise, white_variance
@@ -43,6 +44,8 @@ MAX_BATCH_POWER_BYTES = 6.4e7
 MIN_BATCH_RECORDS = 25
 _RECORDS_PER_CHUNK = 25  # limits memory
 _KURTOSIS_SAMPLES = 10**6  # simulated sample by sample; limits time
+#: Share of the blocks on either side, whose kurtosis may be that of outliers. Design choice.
+_TRIMMED = 0.1
 _MAX_BANDS_APART = 4  # of bands that the taper correlates
 _MIN_BAND_CORRELATION = 0.003  # smaller ones are neglected
 _MAX_COMMON_SHARE = 0.9  # of the scatter of a band that may be common with others
@@ -131,7 +134,12 @@ def _prepare_nulls(
         sample_sd.append(np.sqrt(variances))
     if "broad_peaks" in baseline:
         density = np.concatenate([density, baseline["broad_peaks"].values[..., None]], axis=-1)
-    kurtosis = np.array([_kurtosis_excess(blocks, axis_density, rng) for axis_density in density])
+    kurtosis = np.array(
+        [
+            _kurtosis_excess(blocks, axis_density, recorded[np.isfinite(recorded)], rng)
+            for axis_density, recorded in zip(density, blocks["kurtosis"].values, strict=True)
+        ]
+    )
     ties = _common_shapes(baseline["shape_alone"].values, int(blocks.attrs["block_samples"]))
     shared = find_shared_noise(blocks, baseline)
     return _NullSetup(
@@ -183,11 +191,13 @@ def _pairs_of_bands(
 
 
 def _kurtosis_excess(
-    blocks: xr.Dataset, density: Floats, rng: np.random.Generator
+    blocks: xr.Dataset, density: Floats, recorded: Floats, rng: np.random.Generator
 ) -> tuple[float, float]:
     """Simulate the kurtosis of full blocks of noise (line, term); return mean and scatter excess.
 
-    Correlation widens its scatter; a resonance and the rounding of an angle change its mean.
+    Correlation widens its scatter; a resonance and the rounding of an angle change its mean. Q may
+    be the rounding of an angle, which is uniform, or other noise of the angle, which is normal. The
+    mean is between both, where most of the `recorded` blocks are.
     """
     size, rate = int(blocks.attrs["block_samples"]), float(blocks.attrs["sampling_rate_hz"])
     shaped = np.zeros(size // 2 + 1)
@@ -195,12 +205,26 @@ def _kurtosis_excess(
     record_count = int(np.clip(_KURTOSIS_SAMPLES // size, 200, 2000))
     normal = rng.standard_normal((record_count, shaped.size, 2)) @ np.array([1.0, 1j])
     values = np.fft.irfft(normal * np.sqrt(shaped * rate * size / 2.0), n=size, axis=1)
-    rounding = np.sqrt(12.0 * density[:, 0].mean() * rate / 2.0)
-    values += np.diff(rounding * rng.random((record_count, size + 1)), axis=1)
-    values -= values.mean(axis=1, keepdims=True)
-    kurtosis = (values**4).mean(axis=1) / (values**2).mean(axis=1) ** 2 - 3.0
+    angle_sd, shape = np.sqrt(density[:, 0].mean() * rate / 2.0), (record_count, size + 1)
+    rounded, normal_angle = (
+        _sample_kurtosis(values + np.diff(angle_sd * angle, axis=1))
+        for angle in (np.sqrt(12.0) * rng.random(shape), rng.standard_normal(shape))
+    )
+    low, high, observed = (
+        float(trim_mean(kurtosis, _TRIMMED)) if kurtosis.size else np.nan
+        for kurtosis in (rounded, normal_angle, recorded)
+    )
+    is_between = recorded.size and high > low
+    share = np.clip((observed - low) / (high - low), 0.0, 1.0) if is_between else 0.0
+    excess = (1.0 - share) * rounded.mean() + share * normal_angle.mean()
     mean, variance, _ = kurtosis_moments(np.array(float(size)))
-    return float(kurtosis.mean() - mean), float(kurtosis.std() / np.sqrt(variance))
+    return float(excess - mean), float(rounded.std() / np.sqrt(variance))
+
+
+def _sample_kurtosis(values: Floats) -> Floats:
+    """Return the excess kurtosis of each record (record, sample)."""
+    values = values - values.mean(axis=1, keepdims=True)
+    return np.asarray((values**4).mean(axis=1) / (values**2).mean(axis=1) ** 2 - 3.0)
 
 
 def _draw_records(setup: _NullSetup, count: int, rng: np.random.Generator) -> xr.Dataset:

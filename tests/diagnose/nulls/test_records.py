@@ -14,6 +14,7 @@ from gyrostab.diagnose.baseline.from_model import baseline_from_model
 from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.reduce.block_statistics import reduce_log
 from gyrostab.diagnose.reduce.outliers import EXPECTED_FALSE_OUTLIERS
+from gyrostab.ingest.make_log import make_log
 from gyrostab.kernels.spectra.periodogram import band_covariance
 from gyrostab.simulate import simulate
 from tests.support.evidence import mean_evidence, power_evidence
@@ -161,6 +162,21 @@ def test_tails_of_the_kurtosis_match_samples():
         assert float(nulls["kurtosis"].quantile(share)) == pytest.approx(
             np.quantile(kurtosis, share), abs=tolerance
         )
+
+
+@pytest.mark.parametrize("kind", ["rounded", "normal"])
+def test_noise_of_an_angle_may_be_rounding_or_normal(kind):
+    rng = np.random.default_rng(5)
+    angle = rng.random((3, 72_001)) if kind == "rounded" else rng.standard_normal((3, 72_001)) / 3.0
+    rate = 0.1 * rng.standard_normal((3, 72_000)) + np.diff(angle, axis=1)
+    record = reduce_log(make_log(rate, rate=20.0, unit="deg/h"))
+    nulls = joined(
+        list(null_records(record, calibrate_noise(record), count=50, rng=np.random.default_rng(1)))
+    )
+    usual, drawn = (record["kurtosis"].mean("block"), nulls["kurtosis"].mean("block"))
+    scatter = drawn.std("record")
+    assert (np.abs(usual - drawn.mean("record")) < 3.0 * scatter).all()
+    assert bool((usual < -10.0 * scatter).all()) is (kind == "rounded")
 
 
 def test_quantization_causes_repeats_zeros_and_extremes():
