@@ -54,11 +54,12 @@ def attribute_mismatches(
     """Find the effects that explain each mismatch.
 
     An effect explains a mismatch when it acts on one of its axes at its time and can show in its
-    statistic. If the baseline with the effects contains what the effect does there, two more
-    conditions apply: the mismatch is gone with that baseline, or nearly so, and this effect is
-    needed for that. A mismatch of the mean, or at a restart, may also lie before or after the
-    effect, when the effect causes the difference. In blocks within which an effect moves the rate,
-    power and the lowest lines exceed the noise; the effect explains these too.
+    statistic; what it adds to calibrated noise, at any time. If the baseline with the effects
+    contains what the effect does there, two more conditions apply: the mismatch is gone with that
+    baseline, or nearly so, and this effect is needed for that. A mismatch of the mean, or at a
+    restart, may also lie before or after the effect, when the effect causes the difference. In
+    blocks within which an effect moves the rate, power and the lowest lines exceed the noise; the
+    effect explains these too.
 
     `after` is the baseline with the effects, and `without` returns that except for those given, at
     the sizes of the joint fit. Without it, whether an effect is needed is not tested: every effect
@@ -93,6 +94,7 @@ def attribute_mismatches(
             blocks,
             partial(score_left, region),
             is_tested=without is not None,
+            is_calibrated=after.attrs.get("source") == "calibrated",
             settings=settings,
         )
         for region in located
@@ -106,9 +108,14 @@ def _explain_mismatch(
     left: ScoreLeft,
     *,
     is_tested: bool,
+    is_calibrated: bool,
     settings: Settings,
 ) -> list[str]:
-    """Return the effects that explain a mismatch; `is_tested` says whether they must be needed."""
+    """Return the effects that explain a mismatch; `is_tested` says whether they must be needed.
+
+    Noise that `is_calibrated` on the record contains what an effect adds on the average. Where the
+    effect adds less, or nothing, the record is quieter than this noise.
+    """
     score, limit = left(())
     shown = []
     for effect in timed_effects:
@@ -116,6 +123,11 @@ def _explain_mismatch(
         if components and (
             _acts_at(region, effect, blocks, settings)
             or (is_tested and _is_caused_elsewhere(region, effect, components, left))
+            or (
+                is_calibrated
+                and score < limit
+                and all(component.statistic.is_power for component in components)
+            )
         ):
             shown.append((effect.identification, components))
     needed = [identification for identification, _ in shown]

@@ -110,6 +110,24 @@ def test_mismatch_lists_the_effects_that_it_needs(shaken):
     assert attributed("mean", without=without) == {frozenset({"vibration_rectification"})}
 
 
+@pytest.mark.parametrize(("source", "attributed"), [("calibrated", True), ("simulation", False)])
+def test_noise_of_an_effect_in_the_calibration_is_missing_where_it_is_quiet(
+    shaken, source, attributed
+):
+    blocks, baseline, identifications, null = shaken
+    (noise, *_) = identifications.identified
+    calibrated = baseline.assign(spectrum=1.3 * baseline["spectrum"])
+    regions = [
+        region
+        for region in locate_mismatches(blocks, calibrated, null)
+        if region["quantity"] == "level" and region["ratio"] < 1.0 and "x" in region["axes"]
+    ]
+    assert regions
+    after = predict_baseline(identifications, baseline).assign_attrs(source=source)
+    lists = attribute_mismatches(regions, [noise], blocks, after, null, level=0.005)
+    assert all((names == ["vibration_noise"]) is attributed for names in lists)
+
+
 def test_blocks_with_anomalous_samples_are_attributed_to_them(shaken):
     blocks, baseline, identifications, null = shaken
     loud, _, spikes = identifications.identified
