@@ -86,7 +86,9 @@ class TemperatureBias(Effect):
         return above * (self.sensitivity + above * (self.quadratic + above * self.cubic)), state
 
     def nuisance(self, windows: Windows) -> Mapping[str, Floats]:
-        return {"sensor_lag": _SENSOR_LAGS_S}
+        """List the lags; the reference is the mean temperature, at which the terms differ most."""
+        mean = round(float(np.mean(windows.drivers["temperature"])), 1)
+        return {"reference": np.array([mean]), "sensor_lag": _SENSOR_LAGS_S}
 
     def explain(self, windows: Windows) -> Prediction:
         """Predict window means proportional to powers of the temperature."""

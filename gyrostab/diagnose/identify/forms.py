@@ -15,6 +15,7 @@ from gyrostab.diagnose.predict.candidates import Component, Variant
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.predict.sizes import component_mixture
 from gyrostab.physics.registry import effects
+from gyrostab.wording import join_words
 
 
 def choose_forms(identifications: Identifications, baseline: xr.Dataset) -> Identifications:
@@ -101,7 +102,8 @@ def prefer_plainer(component: Component, state: State) -> Component:
     """Return a component with a single term where that explains as much, and a note about it.
 
     A component of neither means nor powers is returned as it is. The state has all other effects.
-    A component of one term gets the first of those that explain as much, but for 3 nats and an
+    Terms that explain nothing beyond the others are left out, if the record separates them. A
+    component of one term gets the first of those that explain as much, but for 3 nats and an
     error of the form. Terms that rise and fall together, as g^2 and g^4 at one level of vibration,
     would otherwise get large and opposite sizes that are both wrong.
     """
@@ -141,9 +143,39 @@ def prefer_plainer(component: Component, state: State) -> Component:
         total_nats = 0.5 * float(mean @ np.linalg.solve(covariance, mean))
         needed_nats = settings.reject_nats + settings.form_error_share * term_nats[name]
         if correlation < settings.term_correlation and total_nats - term_nats[name] > needed_nats:
-            return component
+            return _drop_needless_terms(component, state)
         other_names = [other for other in component.variant.columns if other != name]
     return replace(component, variant=terms[name], note=_describe_unseparated(name, other_names))
+
+
+def _drop_needless_terms(component: Component, state: State) -> Component:
+    """Return a component without the terms that explain hardly anything beyond the others.
+
+    The term that adds least is dropped first, as long as it adds less than 3 nats.
+    """
+    needed = component.variant
+    while len(needed.columns) > 1:
+        fewer = [
+            needed.with_columns(tuple(name for name in needed.columns if name != dropped))
+            for dropped in needed.columns
+        ]
+        nats = [_explained_nats(component, state, variant) for variant in fewer]
+        lost_nats = _explained_nats(component, state, needed) - max(nats)
+        if lost_nats > state.settings.ambiguous_nats:
+            break
+        needed = fewer[int(np.argmax(nats))]
+    if needed is component.variant:
+        return component
+    family = component.candidate.family(component.variant)
+    reduced = tuple(variant.with_columns(needed.columns) for variant in family)
+    variants = (*component.candidate.variants, *reduced)
+    dropped_names = [name for name in component.variant.columns if name not in needed.columns]
+    return replace(
+        component,
+        candidate=replace(component.candidate, variants=variants),
+        variant=next((variant for variant in reduced if variant.values == needed.values), needed),
+        note=_describe_dropped(dropped_names),
+    )
 
 
 def _explained_nats(component: Component, state: State, variant: Variant | None = None) -> float:
@@ -156,11 +188,14 @@ def _explained_nats(component: Component, state: State, variant: Variant | None 
 
 
 def _describe_unseparated(name: str, other_names: Sequence[str]) -> str:
-    others = " and ".join(other_names)
+    terms, others = join_words([name, *other_names]), join_words(other_names)
     verb = "is" if len(other_names) == 1 else "are"
-    return (
-        f"The record does not separate the terms {name} and {others}; {others} {verb} taken as 0."
-    )
+    return f"The record does not separate the terms {terms}; {others} {verb} taken as 0."
+
+
+def _describe_dropped(names: Sequence[str]) -> str:
+    terms, verb = ("term", "it is") if len(names) == 1 else ("terms", "they are")
+    return f"The record shows no sign of the {terms} {join_words(names)}; {verb} taken as 0."
 
 
 def _single_term_variant(component: Component, state: State, name: str) -> Variant | None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -82,6 +82,13 @@ class Variant:
     def has_columns_of(self, other: Variant) -> bool:
         """Return whether two variants have the same parameters, in the same power."""
         return self.columns == other.columns and self.squared == other.squared
+
+    def with_columns(self, columns: tuple[str, ...]) -> Variant:
+        """Return the variant with some of its columns."""
+        if columns == self.columns:
+            return self
+        places = [self.columns.index(name) for name in columns]
+        return replace(self, columns=columns, design=self.design[places])
 
 
 class Prospect(NamedTuple):

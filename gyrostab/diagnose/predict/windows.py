@@ -200,10 +200,15 @@ def rebuild_variant(
         windows = make_windows(blocks, driver_names(candidate))
     effect = effects()[candidate.effect].example(**variant.values)
     prediction = with_correlated_powers(predict_exogenous(effect, windows), blocks)
-    built = candidate.statistic.design(
-        Prospect(dict(variant.values), prediction, blocks, coefficient)
-    )
-    return next((rebuilt for rebuilt in built if rebuilt.has_columns_of(variant)), None)
+    prospect = Prospect(dict(variant.values), prediction, blocks, coefficient)
+    built = [*candidate.statistic.design(prospect)]
+    same = [rebuilt for rebuilt in built if rebuilt.has_columns_of(variant)]
+    larger = [
+        rebuilt.with_columns(variant.columns)
+        for rebuilt in built
+        if set(variant.columns) < set(rebuilt.columns) and rebuilt.squared == variant.squared
+    ]
+    return next(iter([*same, *larger]), None)
 
 
 def distinct_variants(variants: list[Variant]) -> tuple[Variant, ...]:
