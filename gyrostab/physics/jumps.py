@@ -172,7 +172,11 @@ class BiasJump(Effect):
         return Prediction(mean={"step": _share_after(windows, self.at)})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        parts = [f"by {self.quantity('step', errors)} at {self.at:.6g} s"] if any(self.step) else []
+        parts = (
+            [f"by {self.quantity('step', errors)} at {self.quantity('at', errors)}"]
+            if any(self.step)
+            else []
+        )
         parts += [f"by {self.quantity('restart', errors)} rms at restarts"] if self.restart else []
         if self.shock:
             size = self.quantity("shock", errors)

@@ -22,7 +22,7 @@ from gyrostab.diagnose.identify.components import axes_of
 from gyrostab.diagnose.identify.identifications import Identifications
 from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.predict.average_sizes import Size
-from gyrostab.diagnose.predict.candidates import Component
+from gyrostab.diagnose.predict.candidates import TIME_PARAMETER, Component
 from gyrostab.diagnose.predict.linear_model import State
 from gyrostab.diagnose.reduce.zero_bin import truncated_axes
 from gyrostab.diagnose.settings import Settings
@@ -217,8 +217,10 @@ def _make_estimates(
             continue
         parameter = parameters.get(name.split(".")[0])
         unit = parameter.unit if parameter else "1"
-        # the error of an angle contains it
-        is_exact = unit == _ANGLE or (statistic.is_line and name == _FREQUENCY)
+        # the error of an angle contains it, and the origin of a time means nothing
+        is_exact = (
+            unit == _ANGLE or name == TIME_PARAMETER or (statistic.is_line and name == _FREQUENCY)
+        )
         form = 0.0 if is_exact else settings.size_error_share * mean
         positive = parameter is not None and parameter.low >= 0.0
         estimates[name] = _make_estimate(mean, sd, unit, ends=ends, positive=positive, form=form)

@@ -136,6 +136,51 @@ def test_terms_not_separated_by_one_level_become_one(noise_only, levels, has_bot
             assert fitted.parameters[name].low < truth < fitted.parameters[name].high
 
 
+def test_time_of_a_jump_has_no_error_of_the_form(noise_only):
+    """Late in a record, a share of the time since its start would be many blocks."""
+    blocks, baseline = noise_only
+    block_s = float(blocks.attrs["block_s"])
+    begin, end = blocks["begin"].values, blocks["end"].values
+    time = 0.8 * end[-1] + 0.3 * block_s
+    step = xr.DataArray(np.clip((end - time) / (end - begin), 0.0, 1.0), dims="block")
+    drawn = next(null_records(blocks, baseline, count=1, rng=np.random.default_rng(4), chunk=1))
+    mean = drawn["mean"].isel(record=0).transpose("axis", "block")
+    changed = blocks.assign(mean=mean + 2.0 * step)
+    frame = identify_by_hand(changed, baseline, "bias_jump", "mean", ("step",), at=time)
+    (fitted,) = fit_identifications(choose_forms(frame, baseline), baseline)
+    at = fitted.parameters["at"]
+    assert at.low < time < at.high
+    assert at.high - at.low < 2.0 * block_s
+    assert fitted.say().endswith(f" ± {at.stderr:.2g} s.")
+
+
+@pytest.mark.parametrize("present", [("sensitivity", "quadratic"), ("quadratic", "cubic")])
+def test_terms_that_explain_nothing_are_left_out(noise_only, present):
+    blocks, baseline = noise_only
+    sizes = {"sensitivity": 0.02, "quadratic": -0.002, "cubic": 0.0003}
+    columns = tuple(sizes)
+    frame = identify_by_hand(blocks, baseline, "temperature_bias", "mean", columns)
+    variant = frame.identified[0].components[0].variant
+    assert variant.values["reference"] == pytest.approx(
+        float(blocks["channel_temperature"].mean()), abs=0.06
+    )
+    shape = sum(
+        sizes[name] * column[0]
+        for name, column in zip(columns, variant.design, strict=True)
+        if name in present
+    )
+    drawn = next(null_records(blocks, baseline, count=1, rng=np.random.default_rng(4), chunk=1))
+    mean = drawn["mean"].isel(record=0).transpose("axis", "block")
+    changed = blocks.assign(mean=mean + xr.DataArray(shape, dims="block"))
+    frame = identify_by_hand(changed, baseline, "temperature_bias", "mean", columns)
+    (fitted,) = fit_identifications(choose_forms(frame, baseline), baseline)
+    assert set(fitted.parameters) - {"sensor_lag"} == set(present)
+    (absent,) = set(columns) - set(present)
+    assert f"no sign of the term {absent}; it is taken as 0" in fitted.say()
+    for name in present:
+        assert fitted.parameters[name].low < sizes[name] < fitted.parameters[name].high
+
+
 @pytest.mark.parametrize(
     ("levels", "column"),
     [
