@@ -36,8 +36,8 @@ class EarthRate(Effect):
     Examples
     --------
     >>> print(EarthRate(latitude=60).say())
-    The earth turns at 15.04 deg/h; at latitude 60 deg, the tool sees 7.521 deg/h across its axis
-    and -13.03 deg/h along it, on all axes.
+    The tool sees 7.521 deg/h of the earth's 15.04 deg/h across its axis and -13.03 deg/h along it,
+    on all axes, as it does at latitude 60 deg if it is vertical.
     """
 
     name = "earth_rate"
@@ -144,10 +144,28 @@ class EarthRate(Effect):
         )
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        along, high, right = self.components()
-        across = math.hypot(high, right)
-        components = (
-            f"{across:.4g} deg/h across its axis and {along:.4g} deg/h along it, {self.on_axes()}"
+        along, _, _ = self.components()
+        attitude = (
+            f"at an inclination of {self.quantity('inclination')} and an azimuth of "
+            f"{self.quantity('azimuth')}"
+            if self.inclination
+            else "if it is vertical"
         )
-        earth = f"The earth turns at {self.quantity('rate', errors)}"
-        return f"{earth}; at latitude {self.quantity('latitude')}, the tool sees {components}."
+        return (
+            f"{self._say_across(errors)} and {along:.4g} deg/h along it, {self.on_axes()}, as it "
+            f"does at latitude {self.quantity('latitude', errors)} {attitude}."
+        )
+
+    def say_in_record(self, windows: Windows, errors: Mapping[str, float] | None = None) -> str:
+        """Describe the rate that turns; the constant one along the tool is part of the bias."""
+        return (
+            f"{self._say_across(errors)}, {self.on_axes()}, as a vertical tool does at latitude "
+            f"{self.quantity('latitude', errors)}."
+        )
+
+    def _say_across(self, errors: Mapping[str, float] | None) -> str:
+        across = math.hypot(*self.components()[1:])
+        return (
+            f"The tool sees {across:.4g} deg/h of the earth's {self.quantity('rate', errors)} "
+            "across its axis"
+        )

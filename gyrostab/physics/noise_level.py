@@ -19,6 +19,7 @@ from gyrostab.errors import OptionError, SchemaError
 from gyrostab.noise import sampled_psd
 from gyrostab.physics.base import Chunk, Effect, Likeness, Prediction, Setup, Windows, parameter
 from gyrostab.units import HOUR, INNER
+from gyrostab.wording import join_words
 
 #: Least N^2 of a polynomial law, as a share of its value at the reference (a tenth of N). Outside
 #: of the range where it was measured, the polynomial could be negative.
@@ -147,8 +148,8 @@ class LightPowerNoise(Effect):
     Examples
     --------
     >>> print(LightPowerNoise(thermal=0.2, shot=0.1).say())
-    The angle random walk follows the light power on all axes: at 0.0001 W 0.2 of N^2 is noise of
-    the detector and 0.1 shot noise.
+    The angle random walk follows the light power on all axes: at 0.0001 W, 0.2 of N^2 is detector
+    noise and 0.1 of N^2 is shot noise.
     """
 
     name = "light_power_noise"
@@ -228,10 +229,15 @@ class LightPowerNoise(Effect):
         return Prediction(level={("N", "thermal"): loss**2 - 1.0, ("N", "shot"): loss - 1.0})
 
     def say(self, errors: Mapping[str, float] | None = None) -> str:
-        thermal, shot = self.quantity("thermal", errors), self.quantity("shot", errors)
-        shares = f"{thermal} of N^2 is noise of the detector and {shot} shot noise"
+        kinds = {"thermal": "detector", "shot": "shot"}
+        shares = join_words(
+            [
+                f"{self.quantity(name, errors)} of N^2 is {kinds[name]} noise"
+                for name in self.list_sizes() or tuple(kinds)
+            ]
+        )
         follows = f"The angle random walk follows the light power {self.on_axes()}"
-        return f"{follows}: at {self.quantity('nominal')} {shares}."
+        return f"{follows}: at {self.quantity('nominal')}, {shares}."
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -65,8 +65,8 @@ class Restart(Statistic):
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
         return (
-            f"The rate of {axes_text(region['axes'])} does not resume where it ended when the "
-            f"power returns, {when}"
+            f"The rate of {axes_text(region['axes'])} after gaps in which the tool may have been "
+            f"off is not what it was before them, {when}"
         )
 
 
