@@ -2,12 +2,13 @@
 
     python benchmarks/name_probability.py proof-tuning [MORE ...]
 
-Fits `set_probability` and `alternative_weight` of `gyrostab.diagnose.settings` to the names of the
-diagnoses in these folders by maximum likelihood (`gyrostab.diagnose.result.verdict` has the law).
-Prints both with their standard errors, the log scores and calibration errors of the values in the
-settings, and of values fitted to the other folders only; and the log score of one probability for
-all names, which is fitted to nine tenths and scored on the other, ten times. Give runs of which the
-ground truths are known already: a seed below 1 000 000, or one in the register of docs/proof.md.
+Fits `set_probability`, `alternative_weight` and `even_odds_nats` of `gyrostab.diagnose.settings` to
+the names of the diagnoses in these folders by maximum likelihood
+(`gyrostab.diagnose.result.verdict` has the law). Prints them with their standard errors, the log
+scores and calibration errors of the values in the settings, and of values fitted to the other
+folders only; and the log score of one probability for all names, which is fitted to nine tenths and
+scored on the other, ten times. Give runs of which the ground truths are known already: a seed below
+1 000 000, or one in the register of docs/proof.md.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from page import make_parser
 from scipy.optimize import minimize
-from scipy.special import expit
+from scipy.special import expit, logit
 
 from gyrostab.arrays import Bools, Floats, Ints
 from gyrostab.blindtest.scoring.probability import expected_calibration_error
@@ -28,7 +29,7 @@ from gyrostab.blindtest.scoring.score import drawn_rows, score_case
 from gyrostab.diagnose.settings import DEFAULTS
 
 PARTS = 10
-#: Standard deviation of the two log odds of the fit about zero, which bounds them.
+#: Standard deviation of the three logarithms of the fit about zero, which bounds them.
 PRIOR_SD = 3.0
 STEP = 1e-3
 
@@ -37,6 +38,7 @@ class Names(NamedTuple):
     """Identified names."""
 
     run: Ints  # number of the folder
+    evidence_nats: Floats
     rivals: Floats  # sum of exp(evidence of an alternative - evidence) over the alternatives
     right: Bools
 
@@ -54,14 +56,20 @@ def main() -> None:
         f"{has_no_rival.sum()} without alternatives, {names.right[has_no_rival].mean():.3f} right"
     )
     for label, value, (low, high) in zip(
-        ("set_probability", "weight of an alternative"),
-        (expit(best[0]), math.exp(best[1])),
-        (expit(ends[0]), np.exp(ends[1])),
+        ("set_probability", "weight of an alternative", "evidence of even odds"),
+        (expit(best[0]), math.exp(best[1]), math.exp(best[2])),
+        (expit(ends[0]), np.exp(ends[1]), np.exp(ends[2])),
         strict=True,
     ):
         print(f"{label}: {value:.3f} ({low:.3f} to {high:.3f})")
-    stated = DEFAULTS.set_probability / (1.0 + DEFAULTS.alternative_weight * names.rivals)
-    print_score("stated", stated, names.right)
+    settings = np.array(
+        [
+            logit(DEFAULTS.set_probability),
+            math.log(DEFAULTS.alternative_weight),
+            math.log(DEFAULTS.even_odds_nats),
+        ]
+    )
+    print_score("settings", probabilities(settings, names), names.right)
     if len(np.unique(names.run)) > 1:
         print_score("fitted to the other folders", fit_without_own_run(names), names.right)
     constant = cross_validate(names)
@@ -77,7 +85,7 @@ def print_score(label: str, stated: Floats, right: Bools) -> None:
 
 def collect_names(runs: list[Path]) -> Names:
     """Read the diagnoses and ground truths of blind tests."""
-    numbers, rivals, right = [], [], []
+    numbers, evidence_nats, rivals, right = [], [], [], []
     for number, run in enumerate(runs):
         for path in sorted((run / "diagnoses").glob("*.json")):
             diagnosis = json.loads(path.read_text(encoding="utf-8"))
@@ -85,46 +93,57 @@ def collect_names(runs: list[Path]) -> Names:
             for case in drawn_rows(score_case(diagnosis, truth))[:1]:
                 for identification in case["identifications"]:
                     numbers.append(number)
-                    rivals.append(sum_rivals(identification["name"], diagnosis))
+                    table = strongest_table(identification["name"], diagnosis)
+                    evidence_nats.append(table["held_out_gain"]["nats"])
+                    rivals.append(sum_rivals(table, diagnosis))
                     right.append(identification["exact"])
-    return Names(np.array(numbers), np.array(rivals), np.array(right))
+    return Names(np.array(numbers), np.array(evidence_nats), np.array(rivals), np.array(right))
 
 
-def sum_rivals(name: str, diagnosis: dict[str, Any]) -> float:
+def strongest_table(name: str, diagnosis: dict[str, Any]) -> dict[str, Any]:
+    """Return the table of an effect with the most evidence."""
+    tables: list[dict[str, Any]] = [
+        table for table in diagnosis["effects"] if table["name"] == name
+    ]
+    return max(tables, key=lambda table: table["held_out_gain"]["nats"])
+
+
+def sum_rivals(table: dict[str, Any], diagnosis: dict[str, Any]) -> float:
     """Sum exp(evidence of an alternative - evidence); without a difference it is equal."""
-    table = max(
-        (table for table in diagnosis["effects"] if table["name"] == name),
-        key=lambda table: table["held_out_gain"]["nats"],
-    )
     differences = {
         rejection["name"]: rejection["nats"] or 0.0
         for rejection in diagnosis["rejected"]
-        if rejection["beaten_by"] == name
+        if rejection["beaten_by"] == table["name"]
     }
     return sum(
         float(np.exp(-differences.get(alternative, 0.0))) for alternative in table["alternatives"]
     )
 
 
-def probabilities(law: Floats, rivals: Floats) -> Floats:
-    """Return the probability of each name; `law` has the log odds and the log of the weight."""
-    return np.asarray(expit(law[0]) / (1.0 + np.exp(law[1]) * rivals))
+def probabilities(law: Floats, names: Names) -> Floats:
+    """Return the probability of each name.
+
+    `law` has the log odds of large evidence, and the logarithms of the weight of an alternative and
+    of the evidence of even odds.
+    """
+    log_odds = law[0] * (1.0 - np.exp(law[2]) / names.evidence_nats)
+    return np.asarray(expit(log_odds) / (1.0 + np.exp(law[1]) * names.rivals))
 
 
 def fit_law(names: Names) -> Floats:
     """Fit the law by penalised maximum likelihood."""
-    return np.asarray(minimize(penalised_loss, np.zeros(2), args=(names,)).x)
+    return np.asarray(minimize(penalised_loss, np.zeros(3), args=(names,)).x)
 
 
 def penalised_loss(law: Floats, names: Names) -> float:
     """Return the negative log-likelihood with the prior of the law [nats]."""
-    loss = log_score(probabilities(law, names.rivals), names.right) * names.right.size
+    loss = log_score(probabilities(law, names), names.right) * names.right.size
     return float(loss + 0.5 * (law**2).sum() / PRIOR_SD**2)
 
 
 def curvature(law: Floats, names: Names) -> Floats:
     """Return the second derivatives of the loss."""
-    steps = STEP * np.eye(2)
+    steps = STEP * np.eye(3)
     return np.array(
         [
             [
@@ -147,7 +166,7 @@ def fit_without_own_run(names: Names) -> Floats:
     for run in np.unique(names.run):
         own = names.run == run
         law = fit_law(Names(*(values[~own] for values in names)))
-        stated[own] = probabilities(law, names.rivals[own])
+        stated[own] = probabilities(law, Names(*(values[own] for values in names)))
     return stated
 
 

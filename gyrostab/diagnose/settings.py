@@ -401,18 +401,24 @@ class Settings:
     )
 
     set_probability: float = _make_setting(
-        0.93,
+        0.966,
         "1",
-        "Probability that an identified effect or one of its alternatives is right.",
-        "calibrated on 506 names of two blind tests: 0.927, standard error 0.013 "
-        "(benchmarks/name_probability.py)",
+        "Probability that an effect of large evidence, or one of its alternatives, is right.",
+        "calibrated on 271 names of a blind test (benchmarks/name_probability.py)",
+    )
+    even_odds_nats: float = _make_setting(
+        7.3,
+        "nat",
+        "Evidence at which neither an identified effect nor its alternatives may be right, at even "
+        "odds.",
+        "calibrated on 271 names of a blind test (benchmarks/name_probability.py); the score of 59 "
+        "names of another simulator improves by 4 nats",
     )
     alternative_weight: float = _make_setting(
-        0.25,
+        0.2,
         "1",
         "Probability of an alternative with equal evidence, relative to the name.",
-        "calibrated on 93 names with alternatives in two blind tests: 0.25, one standard error "
-        "from 0.18 to 0.34 (benchmarks/name_probability.py)",
+        "calibrated on 271 names of a blind test (benchmarks/name_probability.py)",
     )
 
     def __post_init__(self) -> None:

@@ -7,10 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import expit, logit, logsumexp
 
 from gyrostab.diagnose.identify.selections import Selection, own_form_error
 from gyrostab.diagnose.settings import DEFAULTS, Settings
+
+MIN_EVIDENCE_NATS = 1e-3  # below which a name is never right; decides nothing
 
 
 def _has_gain(held: Mapping[str, Any]) -> bool:
@@ -75,19 +77,22 @@ def name_probability(identification: Selection, *, settings: Settings = DEFAULTS
     r"""Return the probability that the record contains this effect, and not an alternative.
 
     With the evidence :math:`E` of the effect [nats], and :math:`E_k` of its alternatives in its
-    place, it is :math:`p / (1 + w \sum_k \exp(E_k - E))`: p is the probability that one of them is
-    right, and w the weight of an alternative of equal evidence. An alternative that predicts the
-    same data has the same evidence; so has one whose evidence differs by less than what an error of
-    its form may cost the effect, and that of others differs by so much less.
-    `benchmarks/name_probability.py` fits p and w to blind tests.
+    place, it is :math:`p(E) / (1 + w \sum_k \exp(E_k - E))`: p is the probability that one of them
+    is right, and w the weight of an alternative of equal evidence. The log odds of p are those of
+    large evidence times :math:`1 - E_0 / E`, with even odds at :math:`E_0`. An alternative that
+    predicts the same data has the same evidence; so has one whose evidence differs by less than
+    what an error of its form may cost the effect, and that of others differs by so much less.
+    `benchmarks/name_probability.py` fits p, :math:`E_0` and w to blind tests.
 
     Examples
     --------
-    >>> alone = Selection("shupe", ("temperature",), ("x",), (), 20.0, 8.0)
-    >>> name_probability(alone) == DEFAULTS.set_probability
-    True
+    >>> def alone(nats):
+    ...     return Selection("shupe", ("temperature",), ("x",), (), nats, 8.0)
+    >>> [round(name_probability(alone(nats)), 2) for nats in (10.0, 20.0, 100.0)]
+    [0.71, 0.89, 0.96]
     """
-    evidence_nats = identification.evidence_nats
+    evidence_nats = max(identification.evidence_nats, MIN_EVIDENCE_NATS)
+    log_odds = logit(settings.set_probability) * (1.0 - settings.even_odds_nats / evidence_nats)
     other_nats = [
         max(
             (nats for key, nats in identification.instead.items() if key.partition("(")[0] == name),
@@ -101,7 +106,7 @@ def name_probability(identification: Selection, *, settings: Settings = DEFAULTS
     # E_k - E may be any number of nats.
     weights = [1.0, *[settings.alternative_weight] * len(other_nats)]
     share = np.exp(-logsumexp([0.0, *ahead_nats], b=weights))
-    return float(settings.set_probability * share)
+    return float(expit(log_odds) * share)
 
 
 def decide_verdict(

@@ -11,7 +11,8 @@ from gyrostab.diagnose.identify.selections import Selection
 from gyrostab.diagnose.result.verdict import name_probability
 from gyrostab.diagnose.settings import Settings
 
-SETTINGS = Settings(set_probability=0.9, alternative_weight=0.5)
+#: The probability of a name without alternatives does not depend on its evidence here.
+SETTINGS = Settings(set_probability=0.9, even_odds_nats=0.0, alternative_weight=0.5)
 ALONE = Selection("shupe", ("temperature",), ("x",), (), 20.0, 8.0)
 
 
@@ -21,7 +22,7 @@ def probability(*alternatives: str, **instead: float) -> float:
 
 
 def test_an_alternative_takes_its_share():
-    assert probability() == 0.9
+    assert probability() == pytest.approx(0.9)
     # one that predicts the same data
     assert probability("thermal_gradient") == pytest.approx(0.6)
     assert probability("thermal_gradient", thermal_gradient=20.0) == pytest.approx(0.6)
@@ -60,4 +61,14 @@ def test_the_channel_with_most_evidence_counts():
 
 
 def test_an_effect_that_was_not_an_alternative_does_not_count():
-    assert probability(ageing_bias=19.9) == 0.9
+    assert probability(ageing_bias=19.9) == pytest.approx(0.9)
+
+
+def test_little_evidence_lowers_the_probability():
+    settings = replace(SETTINGS, even_odds_nats=8.0)
+    probabilities = [
+        name_probability(replace(ALONE, evidence_nats=nats), settings=settings)
+        for nats in (-3.0, 4.0, 8.0, 16.0, 1e6)
+    ]
+    # half of the log odds of 9 at twice the evidence of even odds
+    assert probabilities == pytest.approx([0.0, 0.1, 0.5, 0.75, 0.9], abs=1e-5)
