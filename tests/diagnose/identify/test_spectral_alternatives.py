@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -57,4 +59,5 @@ def test_vibration_noise_is_alone_only_if_its_spectrum_fits(kind: str, is_separa
         resonance = identification.components[0].variant.values["resonance"]
         assert resonance == pytest.approx(RESONANCE_HZ, rel=0.4)
     share = 1.0 if is_separated else 1.0 / (1.0 + DEFAULTS.alternative_weight)
-    assert name_probability(identification) == pytest.approx(share * DEFAULTS.set_probability)
+    alone = replace(identification, alternatives=())
+    assert name_probability(identification) == pytest.approx(share * name_probability(alone))
