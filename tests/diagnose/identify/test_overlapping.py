@@ -86,7 +86,8 @@ def test_two_opposite_jumps_have_evidence_only_together():
     model = {"log": {"axes": ["x"]}, "noise": {"N": 0.003, "K": 0.005}, "effect": jumps}
     blocks = reduce_log(simulate(model, duration="30min", rate=10.0, seed=4).compute())
     baseline = calibrate_noise(blocks)
-    nulls = list(null_records(blocks, baseline, count=40, rng=np.random.default_rng(1), chunk=40))
+    # the threshold of fewer null records may exceed what each jump alone explains
+    nulls = list(null_records(blocks, baseline, count=400, rng=np.random.default_rng(1), chunk=40))
     (identification,) = name_effects(blocks, baseline, nulls).identified
     assert identification.effect == "bias_jump"
     assert sorted(component.variant.values["at"] for component in identification.components) == [
