@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gyrostab.errors import OptionError, SchemaError
 from gyrostab.kernels.random.coloured import oscillator_psd
 from gyrostab.simulate import simulate
-from tests.support.effect_bench import allan_of_density, build_effect, run, sigma
+from tests.support.effect_bench import allan_of_density, build_effect, run, sigma, windows_of
 
 # --------------------------------------------------------------------------------
 # rotation
@@ -119,6 +119,15 @@ def test_earth_rate_during_rotation_is_a_line_in_quadrature():
     assert ay / ax == pytest.approx(1j, abs=1e-6)  # y stands a quarter ahead of x
     top = sigma(x, rate, [0.371 / 0.25])[0, 0]
     assert top == pytest.approx(0.7246 * across, rel=0.01)
+
+
+def test_a_record_shows_the_earth_rate_across_the_tool_alone():
+    effect = build_effect("earth_rate", latitude=60)
+    text = effect.say_in_record(windows_of(100, 10.0, 1.0))
+    assert "7.521 deg/h of the earth's 15.04 deg/h across its axis" in text
+    assert "as a vertical tool does at latitude 60 deg" in text
+    assert "along it" not in text
+    assert "along it" in effect.say()
 
 
 def test_earth_rate_and_gravity_share_the_frame_of_the_tool():

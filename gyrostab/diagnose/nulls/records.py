@@ -44,7 +44,8 @@ MAX_BATCH_POWER_BYTES = 6.4e7
 MIN_BATCH_RECORDS = 25
 _RECORDS_PER_CHUNK = 25  # limits memory
 _KURTOSIS_SAMPLES = 10**6  # simulated sample by sample; limits time
-#: Share of the blocks on either side, whose kurtosis may be that of outliers. Design choice.
+#: Share of the blocks on either side, whose kurtosis may be that of outliers. Design choice: for
+#: normal values, such a mean has 0.95 of the efficiency of the plain one.
 _TRIMMED = 0.1
 _MAX_BANDS_APART = 4  # of bands that the taper correlates
 _MIN_BAND_CORRELATION = 0.003  # smaller ones are neglected

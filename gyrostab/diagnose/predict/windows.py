@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -202,13 +203,13 @@ def rebuild_variant(
     prediction = with_correlated_powers(predict_exogenous(effect, windows), blocks)
     prospect = Prospect(dict(variant.values), prediction, blocks, coefficient)
     built = [*candidate.statistic.design(prospect)]
-    same = [rebuilt for rebuilt in built if rebuilt.has_columns_of(variant)]
-    larger = [
+    same = (rebuilt for rebuilt in built if rebuilt.has_columns_of(variant))
+    cut_from_larger = (
         rebuilt.with_columns(variant.columns)
         for rebuilt in built
         if set(variant.columns) < set(rebuilt.columns) and rebuilt.squared == variant.squared
-    ]
-    return next(iter([*same, *larger]), None)
+    )
+    return next(chain(same, cut_from_larger), None)
 
 
 def distinct_variants(variants: list[Variant]) -> tuple[Variant, ...]:

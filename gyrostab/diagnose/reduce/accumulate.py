@@ -37,7 +37,8 @@ LAGGED_CHANNEL_PREFIXES = ("temperature", "supply_voltage", "light_power")
 #: Sub-blocks of a block over which the axes are averaged. Design choice: fast switching.
 SUB_BLOCKS = 16
 _MIN_SPECTRUM_SHARE = 0.25  # of a block that must be present for its spectrum; design choice
-#: Samples that a frame which was sent twice has at least; chance repeats fewer on a coarse grid.
+#: Samples that a frame which was sent twice has at least: the first of which chance repeats hardly
+#: any, on finer or coarser grids. Design choice.
 RESENT_LENGTHS = (3, 6, 12)
 _GRID_BLOCKS = 64  # blocks of which samples are kept for the quantization grid; limits memory
 _GRID_SAMPLES_PER_AXIS = 2**16  # limits memory

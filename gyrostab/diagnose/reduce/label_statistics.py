@@ -49,7 +49,8 @@ from gyrostab.time.stamps import format_stamp, to_nanoseconds
 
 _MAX_SMOOTHING_BLOCKS = 2.0  # longest time scale of the smoothing of a channel; design choice
 _STEP_VALUES_PER_BLOCK = 256  # values from which the quantization step is found; limits time
-_MAX_CHANCE_RUNS = 1e-3  # of repeated samples in a record, as its share of false alarms is 1 %
+#: Runs of samples in a record that chance may repeat: a tenth of its false-alarm probability, 1 %.
+_MAX_CHANCE_RUNS = 1e-3
 MIN_MEAN_SHARE = 0.1  # of a block that must be present for its mean; design choice
 _MIN_GAP_S = 1.0  # shorter gaps are not listed; design choice
 #: Variables that are taken unchanged from the batches.

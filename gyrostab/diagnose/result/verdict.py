@@ -12,7 +12,7 @@ from scipy.special import expit, logit, logsumexp
 from gyrostab.diagnose.identify.selections import Selection, own_form_error
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 
-MIN_EVIDENCE_NATS = 1e-3  # below which a name is never right; decides nothing
+_MIN_EVIDENCE_NATS = 1e-3  # avoids a division by zero: the probability is zero far above
 
 
 def _has_gain(held: Mapping[str, Any]) -> bool:
@@ -91,7 +91,7 @@ def name_probability(identification: Selection, *, settings: Settings = DEFAULTS
     >>> [round(name_probability(alone(nats)), 2) for nats in (10.0, 20.0, 100.0)]
     [0.71, 0.89, 0.96]
     """
-    evidence_nats = max(identification.evidence_nats, MIN_EVIDENCE_NATS)
+    evidence_nats = max(identification.evidence_nats, _MIN_EVIDENCE_NATS)
     log_odds = logit(settings.set_probability) * (1.0 - settings.even_odds_nats / evidence_nats)
     other_nats = [
         max(

@@ -21,6 +21,7 @@ from gyrostab.diagnose.nulls.records import null_records
 from gyrostab.diagnose.predict.candidates import Component
 from gyrostab.diagnose.predict.condition import condition_on
 from gyrostab.diagnose.predict.linear_model import initial_state
+from gyrostab.diagnose.predict.windows import rebuild_variant
 from gyrostab.diagnose.settings import DEFAULTS
 from gyrostab.diagnose.statistics.build_candidates import effect_candidates
 from gyrostab.diagnose.statistics.spectral_line import estimate_line, line_quality
@@ -169,6 +170,10 @@ def test_terms_that_explain_nothing_are_left_out(noise_only, present):
         for name, column in zip(columns, variant.design, strict=True)
         if name in present
     )
+    # no variant has these two terms alone
+    candidate, reduced = frame.identified[0].components[0].candidate, variant.with_columns(present)
+    rebuilt = rebuild_variant(candidate, reduced, initial_state(blocks, baseline))
+    np.testing.assert_allclose(rebuilt.design, reduced.design)
     drawn = next(null_records(blocks, baseline, count=1, rng=np.random.default_rng(4), chunk=1))
     mean = drawn["mean"].isel(record=0).transpose("axis", "block")
     changed = blocks.assign(mean=mean + xr.DataArray(shape, dims="block"))
