@@ -101,10 +101,10 @@ class DriftingLine(Statistic):
 
     def describe(self, region: Mapping[str, Any], when: str) -> str:
         first, last = region["quantity"].split()[1:]
-        return (
-            f"The spectrum of {axes_text(region['axes'])} has a drifting line {when}, from about "
-            f"{first} Hz to about {last} Hz"
+        course = (
+            f"near {first} Hz" if first == last else f"from about {first} Hz to about {last} Hz"
         )
+        return f"The spectrum of {axes_text(region['axes'])} has a drifting line {when}, {course}"
 
 
 def _expected_spectrum(blocks: xr.Dataset, baseline: xr.Dataset) -> Floats:

@@ -334,6 +334,8 @@ def test_statements_give_time_scale_and_frequencies():
         "a drifting line over the whole record, from about 1.58 Hz to about 3.42 Hz"
         in mismatch_statement(glide, 2000.0)
     )
+    in_one_section = glide | {"quantity": "drifting 4.71 4.71"}
+    assert "line over the whole record, near 4.71 Hz" in mismatch_statement(in_one_section, 2000.0)
 
 
 def test_lines_of_null_records_leak_like_tapered_noise():
