@@ -76,32 +76,32 @@ def _block_moments(step, K2, ou_variance, ou_time, decay, weight, drive, shared)
     return mean_variance
 
 
-@njit(**INNER)
-def _advance_states(covariance, decay, drive):  # type: ignore[no-untyped-def]
-    m = decay.size
-    for i in range(m):
-        for j in range(m):
-            covariance[i, j] *= decay[i] * decay[j]
-        covariance[i, i] += drive[i]
+@njit(fastmath={"contract"}, **INNER)
+def _advance_states(covariance, decay, drive, gain, F):  # type: ignore[no-untyped-def]
+    """Advance the covariance of the states by a block, less what a mean of variance F tells.
+
+    Only its lower triangle is used.
+    """
+    for j in range(decay.size):
+        f, g = decay[j], gain[j] * F
+        for k in range(j + 1):
+            covariance[j, k] = f * decay[k] * covariance[j, k] - g * gain[k]
+        covariance[j, j] += drive[j]
 
 
-@njit(**INNER)
+@njit(fastmath={"contract"}, **INNER)
 def _project_covariance(covariance, weight, first, gain):  # type: ignore[no-untyped-def]
     """Project the covariance on the mean, from state `first` on; returns its variance."""
     total = 0.0
     for j in range(first, weight.size):
-        gain[j] = 0.0
-        for k in range(first, weight.size):
-            gain[j] += covariance[j, k] * weight[k]
-        total += gain[j] * weight[j]
+        h, projected = weight[j], 0.0
+        for k in range(first, j):
+            c = covariance[j, k]
+            projected += c * weight[k]
+            gain[k] += c * h
+        total += h * (2.0 * projected + covariance[j, j] * h)
+        gain[j] = projected + covariance[j, j] * h
     return total
-
-
-@njit(**INNER)
-def _subtract_gain(covariance, gain, F):  # type: ignore[no-untyped-def]
-    for j in range(gain.size):
-        for k in range(gain.size):
-            covariance[j, k] -= gain[j] * gain[k] * F
 
 
 @njit(fastmath={"contract"}, **INNER)
@@ -187,24 +187,23 @@ def whiten(
             for j in range(m):
                 for c in range(width):
                     state[j, c] *= decay[j]
-            _advance_states(covariance, decay, drive)
+            _advance_states(covariance, decay, drive, gain, 0.0)
             continue
         # of the innovation; the level counts once known
         F = variance[i] + mean_variance
         F += _project_covariance(covariance, weight, 0 if has_level else 1, gain)
         if not has_level:  # the level becomes what the mean says, with the error of all the rest
             has_level = True
-            _advance_states(covariance, decay, drive)
+            _advance_states(covariance, decay, drive, gain, 0.0)
             covariance[0, 0] = F + drive[0] - 2.0 * shared[0]
             for j in range(1, m):
-                covariance[0, j] = covariance[j, 0] = -gain[j] * decay[j] - shared[j]
+                covariance[j, 0] = -gain[j] * decay[j] - shared[j]
             state[0] = columns[i]
             continue
         for j in range(m):
             gain[j] = (decay[j] * gain[j] + shared[j]) / F
         _scale_innovations(columns[i], state, weight, decay, gain, 1.0 / np.sqrt(F), out[i])
-        _advance_states(covariance, decay, drive)
-        _subtract_gain(covariance, gain, F)
+        _advance_states(covariance, decay, drive, gain, F)
         total += np.log(F)
     return out, total
 
