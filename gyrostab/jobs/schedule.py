@@ -117,6 +117,8 @@ def _open_processes(count: int) -> Iterator[Pool]:
 
 def _begin_process(watched_end: Any) -> None:
     """Ignore Ctrl-C, which the parent handles, and end when its end of the pipe is closed."""
+    import dask
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def end_with_pipe() -> None:
@@ -124,6 +126,7 @@ def _begin_process(watched_end: Any) -> None:
         os._exit(1)
 
     threading.Thread(target=end_with_pipe, daemon=True).start()
+    dask.config.set(num_workers=1)  # each process has one core
     # the parent opens the same files and shows the same warnings
     warnings.showwarning = lambda message, *_: None
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -27,14 +26,19 @@ def map_in_order(
     items : iterable
         Items, fetched in a separate thread, one ahead of the work.
     workers : int, optional
-        Number of threads (default: one per core, at most `MAX_WORKERS`).
+        Number of threads (default: ``num_workers`` of the configuration of dask, which the command
+        option ``--workers`` sets, otherwise one per core; at most `MAX_WORKERS`).
 
     Examples
     --------
     >>> list(map_in_order(lambda n: n * n, range(5)))
     [0, 1, 4, 9, 16]
     """
-    workers = workers or min(os.cpu_count() or 1, MAX_WORKERS)
+    if workers is None:
+        import dask
+        from dask.system import CPU_COUNT
+
+        workers = min(dask.config.get("num_workers", None) or CPU_COUNT, MAX_WORKERS)
     source = iter(items)
     nothing = object()
     with (

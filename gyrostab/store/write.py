@@ -23,7 +23,7 @@ from gyrostab.kernels.encoding.counts import to_counts
 from gyrostab.store.layout import find_hdf5_codecs
 from gyrostab.store.lazy import convert_values, find_source, read_box
 from gyrostab.store.private import library_lock
-from gyrostab.store.threads import MAX_WORKERS, map_in_order
+from gyrostab.store.threads import map_in_order
 
 CHUNK_SECONDS = 1200.0
 #: Least and most samples in one chunk, for very slow and very fast logs.
@@ -283,8 +283,6 @@ def _copy_variables(
     progress: Progress | None,
 ) -> None:
     """Read and encode chunks of variables in threads, and write them in order meanwhile."""
-    import dask
-    from dask.system import CPU_COUNT
 
     def read(chunk: tuple[str, _Box, Array | None]) -> tuple[str, _Box, int, Any]:
         name, box, values = chunk
@@ -292,10 +290,7 @@ def _copy_variables(
         return name, box, values.size, encode(name, values)
 
     done, total = 0, sum(variable.size for variable in large.values())
-    workers = min(dask.config.get("num_workers", None) or CPU_COUNT, MAX_WORKERS)
-    for name, box, size, encoded in map_in_order(
-        read, _list_chunks(large, chunks), workers=workers
-    ):
+    for name, box, size, encoded in map_in_order(read, _list_chunks(large, chunks)):
         put(name, box, encoded)
         done += size
         if progress is not None:

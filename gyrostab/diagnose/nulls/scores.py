@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -11,6 +12,7 @@ import xarray as xr
 from gyrostab.arrays import Floats, Ints
 from gyrostab.diagnose.settings import DEFAULTS, Settings
 from gyrostab.diagnose.statistics import STATISTICS
+from gyrostab.store.threads import map_in_order
 
 _KEPT_BELOW_SIGMA = 1.4  # below the largest of independent cells, from which scores are kept
 #: Powers of null records, in bands or at lines, that are scored at once; limits memory.
@@ -88,10 +90,11 @@ def null_scores(
 ) -> NullScores:
     """Collect the scores of null records chunk by chunk, keeping only extreme scores."""
     gathered: dict[str, _ScoreSums] = {}
-    for name, scores in _score_parts(nulls, baseline):
-        if name not in gathered:
-            gathered[name] = _ScoreSums(scores, settings.pooled_records)
-        gathered[name].add(scores)
+    for part_scores in map_in_order(partial(_score, baseline=baseline), _split_records(nulls)):
+        for name, scores in part_scores.items():
+            if name not in gathered:
+                gathered[name] = _ScoreSums(scores, settings.pooled_records)
+            gathered[name].add(scores)
     statistics = {}
     largest = {}
     for name, sums in gathered.items():
@@ -107,19 +110,19 @@ def null_scores(
     return NullScores(statistics, family, settings)
 
 
-def _score_parts(
-    nulls: Iterable[xr.Dataset], baseline: xr.Dataset
-) -> Iterator[tuple[str, xr.Dataset]]:
-    """Yield the name of each statistic with its scores of some null records, for all records."""
+def _split_records(nulls: Iterable[xr.Dataset]) -> Iterator[xr.Dataset]:
+    """Yield null records, as many at a time as are scored at once."""
     for chunk in nulls:
         powers = max(chunk["power"].size, chunk["line_power"].size) // chunk.sizes["record"]
         size = max(_MIN_RECORDS_AT_ONCE, _POWERS_AT_ONCE // powers)
         for first in range(0, chunk.sizes["record"], size):
-            part = chunk.isel(record=slice(first, first + size))
-            for statistic in STATISTICS:
-                scores = statistic.score(part, baseline)
-                if scores is not None:
-                    yield statistic.name, scores
+            yield chunk.isel(record=slice(first, first + size))
+
+
+def _score(records: xr.Dataset, baseline: xr.Dataset) -> dict[str, xr.Dataset]:
+    """Return the scores of some null records in all statistics that they have, by name."""
+    scores = {statistic.name: statistic.score(records, baseline) for statistic in STATISTICS}
+    return {name: of_statistic for name, of_statistic in scores.items() if of_statistic is not None}
 
 
 def standardise(scores: xr.Dataset, null: StatisticNull) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from gyrostab.diagnose.evidence.products import held_out_evidence
 from gyrostab.diagnose.evidence.sample_counts import CountEvidence
 from gyrostab.diagnose.predict.candidates import Candidate, CandidateEvidence
 from gyrostab.diagnose.predict.linear_model import Result, State
+from gyrostab.store.threads import map_in_order
 
 _COLUMNS_AT_ONCE = 300  # limits memory and time, which grow with the square
 _MIN_ROW_NATS = 1.5  # that another axis or statistic must add; design choice
@@ -61,12 +63,16 @@ def compute_evidence(
     for candidate in candidates:
         group_key = (candidate.statistic, candidate.reference, candidate.is_per_axis)
         groups.setdefault(group_key, []).append(candidate)
-    return [
-        evidence
-        for group in groups.values()
-        for part in _split_group(group)
-        for evidence in part[0].statistic.evidence(part, trial)
-    ]
+    parts = [part for group in groups.values() for part in _split_group(group)]
+    trials = (
+        [trial] * len(parts)
+        if rng is None
+        else [trial._replace(rng=own) for own in rng.spawn(len(parts))]
+    )
+    by_part = map_in_order(
+        lambda item: item[0][0].statistic.evidence(*item), zip(parts, trials, strict=True)
+    )
+    return list(chain.from_iterable(by_part))
 
 
 def _split_group(group: Sequence[Candidate]) -> Iterator[list[Candidate]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -154,9 +153,8 @@ def _moving_share(name: str, power: Array, state: State) -> Array:
         return np.ones_like(power)
     row = state.axes.index(name)
     noise = state.baseline["spectrum"].values[row]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a band without data has no motion
-        noise = np.fmax(noise, np.nanquantile(power, state.settings.quiescent_share, axis=0))
+    with_data = np.where(np.isfinite(power).any(axis=0), power, 0.0)
+    noise = np.fmax(noise, np.nanquantile(with_data, state.settings.quiescent_share, axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(power > state.settings.clear_sigma**2 * noise, 1.0 - noise / power, 0.0)
 
