@@ -32,6 +32,7 @@ from gyrostab.diagnose.statistics.allan_surface import allan_surface
 from gyrostab.diagnose.statistics.sample_counts import mask_anomalous_blocks
 from gyrostab.diagnose.statistics.scores import BlockWindows, cube_root_score
 from gyrostab.noise import NORMAL_95
+from gyrostab.store.threads import map_in_order
 
 #: Fits a baseline to the blocks where its argument, a mask, is true.
 FitBaseline = Callable[[Bools], xr.Dataset]
@@ -267,13 +268,15 @@ def _compare_on_folds(
     blocks: xr.Dataset, before: FitBaseline, after: FitBaseline, fold: Ints, added_nats: float
 ) -> tuple[Floats, bool]:
     """Return the gain on all folds (block,) and its variance, and whether the means differ."""
-    gain, moves = np.array([added_nats, 2.0 * abs(added_nats)]), False
-    for number in range(FOLDS):
+
+    def compare(number: int) -> tuple[Floats, bool]:
         held = fold == number
         without, with_effects = before(~held), after(~held)
-        gain = gain + _compare_models(blocks, without, with_effects, held)
-        moves |= not with_effects["known_mean"].equals(without["known_mean"])
-    return gain, moves
+        gain = _compare_models(blocks, without, with_effects, held)
+        return gain, not with_effects["known_mean"].equals(without["known_mean"])
+
+    gains, moves = zip(*map_in_order(compare, range(FOLDS)), strict=True)
+    return sum(gains, np.array([added_nats, 2.0 * abs(added_nats)])), any(moves)
 
 
 def _compare_models(
