@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dask
 import numpy as np
 import pytest
 
@@ -62,3 +63,19 @@ def test_surface_with_effects_matches_the_recording(diagnosis: Diagnosis) -> Non
 
 def test_held_out_misfit_excludes_blocks_with_spikes(diagnosis: Diagnosis) -> None:
     assert diagnosis.content["held_out"]["misfit_after"] == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.full
+def test_result_does_not_depend_on_the_number_of_threads() -> None:
+    """Also where the null records of a statistic are drawn for each of its candidates."""
+    model = {
+        "noise": {"N": N},
+        "environment": [{"profile": "rotation", "points": [[0, 0], [300, 60], [600, 60]]}],
+    }
+    log = simulate(model, duration="10min", rate=10.0, seed=6).compute()
+    contents = []
+    for threads in (1, 4):
+        with dask.config.set(num_workers=threads):
+            content = diagnose(log, nulls=100).content
+        contents.append({**content, "seconds": 0.0})
+    assert contents[0] == contents[1]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
+import dask
 import numpy as np
 import pytest
 import xarray as xr
@@ -15,7 +17,7 @@ from gyrostab.ingest.columns import pieces
 from gyrostab.ingest.columns.pieces import EvenPiece, Spool, find_even, find_line
 from gyrostab.ingest.columns.raw_log import clean_column
 from gyrostab.store.lazy import concatenate_columns, read_into, read_slice
-from gyrostab.store.threads import map_in_order
+from gyrostab.store.threads import MAX_WORKERS, map_in_order
 
 
 def bits(values: np.ndarray) -> np.ndarray:
@@ -104,6 +106,13 @@ def test_results_come_in_the_order_of_the_items_and_few_are_fetched_ahead():
     assert list(results) == [n * n for n in range(1, 50)]
     with pytest.raises(ZeroDivisionError):
         list(map_in_order(lambda n: 1 / n, [2, 1, 0, 3]))
+
+
+@pytest.mark.parametrize("cores", [1, 2, 1000])
+def test_dask_limits_the_threads(cores: int) -> None:
+    with dask.config.set(num_workers=cores):
+        names = [*map_in_order(lambda _: threading.current_thread().name, range(40))]
+    assert len(set(names)) <= min(cores, MAX_WORKERS)
 
 
 @given(
