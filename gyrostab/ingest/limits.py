@@ -48,6 +48,9 @@ LIMITS: Mapping[str, tuple[float, str]] = {
 #: Largest plausible ratio of grid samples to rows, and of declared samples to bytes; see `LIMITS`.
 GRID_SAMPLES_PER_ROW = 100
 STORED_SAMPLES_PER_BYTE = 1000
+#: Largest plausible ratio of the bytes of an array to those that it is packed into: deflate reaches
+#: 1032 with equal values, and 10 with values of a gyro that hardly change.
+PACKED_RATIO = 100
 
 
 def check_limits(given: Mapping[str, Any] | None) -> dict[str, float]:
@@ -168,4 +171,16 @@ def check_chunk(
             f"{path.name}: a chunk of {name!r} has {chunk_bytes:.4g} bytes. If the file is "
             "damaged, copy it again, else store it in "
             f"smaller chunks; {describe_limit('chunk_bytes', chunk_bytes, given)}"
+        )
+
+
+def check_packed(
+    path: Path, packed_bytes: int, unpacked_bytes: int, given: Mapping[str, float] | None = None
+) -> None:
+    """Refuse a compressed array that needs far more memory than its bytes in the file."""
+    if unpacked_bytes > max(limit_value("chunk_bytes", given), PACKED_RATIO * packed_bytes):
+        raise FormatError(
+            f"{path.name}: an array of {unpacked_bytes:.4g} bytes is packed into {packed_bytes:,} "
+            "bytes, so that nearly all of its values are equal. If the file is damaged, copy it "
+            f"again; {describe_limit('chunk_bytes', unpacked_bytes, given)}"
         )

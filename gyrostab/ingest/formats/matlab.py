@@ -17,7 +17,7 @@ import struct
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import cache
@@ -50,7 +50,7 @@ from gyrostab.ingest.formats.tables import (
     library,
     make_reader,
 )
-from gyrostab.ingest.limits import check_chunk
+from gyrostab.ingest.limits import check_chunk, check_packed
 from gyrostab.ingest.options import ReadOptions
 from gyrostab.store.damage import check_global_heaps
 
@@ -96,7 +96,7 @@ def _make_tables(path: Path, options: ReadOptions, stack: ExitStack) -> TablesOf
     objects: list[str] = []
     sized_columns = [
         (max(array.shape), column)
-        for name, array in _find_arrays(path, stack, objects)
+        for name, array in _find_arrays(path, stack, objects, options.limits)
         for column in _columns_of(path, name, array, options)
     ]
     try:
@@ -189,12 +189,14 @@ def _columns_of(path: Path, name: str, array: Any, options: ReadOptions) -> Iter
         yield from StoredArray(array, along).make_columns(names, attributes)
 
 
-def _find_arrays(path: Path, stack: ExitStack, objects: list[str]) -> Iterable[tuple[str, Any]]:
+def _find_arrays(
+    path: Path, stack: ExitStack, objects: list[str], limits: Mapping[str, float]
+) -> Iterable[tuple[str, Any]]:
     """Find names and arrays of numbers; descriptions of MATLAB objects are added to `objects`."""
     head = read_head(path)[:1024]
     if b"MATLAB 7.3" in head[:128] or b"\x89HDF" in head or path.suffix.lower() in HDF_SUFFIXES:
         return _find_hdf_arrays(path, stack, objects)
-    return read_arrays(path, objects)
+    return read_arrays(path, objects, limits)
 
 
 def _find_hdf_arrays(path: Path, stack: ExitStack, objects: list[str]) -> list[tuple[str, Any]]:
@@ -284,7 +286,9 @@ def _make_column(
         yield len(values), TableColumn((header,), values, unit, dtype=values.dtype)
 
 
-def read_arrays(path: Path, objects: list[str]) -> Arrays:
+def read_arrays(
+    path: Path, objects: list[str], limits: Mapping[str, float] | None = None
+) -> Arrays:
     """Yield names and arrays of numbers; descriptions of MATLAB objects are added to `objects`.
 
     Fields of a structure are called ``name.field``. Files of other levels are left to scipy.
@@ -300,15 +304,17 @@ def read_arrays(path: Path, objects: list[str]) -> Arrays:
             return
         order = "<" if head[126:128] == b"IM" else ">"
         try:
-            for elements in _find_variables(file, order, path.stat().st_size):
+            for elements in _find_variables(file, order, path, limits):
                 yield from elements.find_numbers("", objects)
         except _DAMAGE as error:
             problem = f"this MATLAB file is damaged or cut off ({error}); copy it again"
             raise FormatError(f"{path.name}: {problem}") from error
 
 
-def _find_variables(file: BinaryIO, order: str, size: int) -> Iterator[_Elements]:
-    place = _HEADER_BYTES
+def _find_variables(
+    file: BinaryIO, order: str, path: Path, limits: Mapping[str, float] | None
+) -> Iterator[_Elements]:
+    place, size = _HEADER_BYTES, path.stat().st_size
     while place < size:
         file.seek(place)
         kind, length = struct.unpack(order + "II", file.read(8))
@@ -319,11 +325,16 @@ def _find_variables(file: BinaryIO, order: str, size: int) -> Iterator[_Elements
             raise ValueError(f"an array ends {place - size} bytes behind the file")
         data = file.read(length)
         if kind == _COMPRESSED:
-            data = zlib.decompress(data)
-            kind, length = struct.unpack(order + "II", data[:8])
-            if kind != _MATRIX or length > len(data) - 8:
+            unpacker = zlib.decompressobj()
+            kind, length = struct.unpack(order + "II", unpacker.decompress(data, 8))
+            if kind != _MATRIX:
                 raise ValueError("a compressed element does not hold an array")
-            data = data[8 : 8 + length]
+            check_packed(path, len(data), length, limits)
+            # one more byte, so that the checksum behind the last one is read
+            data = unpacker.decompress(unpacker.unconsumed_tail, length + 1)
+            if len(data) < length or (len(data) == length and not unpacker.eof):
+                raise ValueError(f"a compressed array of {length} bytes is cut off")
+            data = data[:length]
         yield _Elements(data, order)
 
 

@@ -90,3 +90,25 @@ def test_a_matlab_file_that_is_cut_off_is_refused(
     (tmp_path / "cut.mat").write_bytes(matlab[1].read_bytes()[:size])
     with pytest.raises(FormatError, match=r"cut\.mat: this MATLAB file is damaged or cut off"):
         list(read_arrays(tmp_path / "cut.mat", []))
+
+
+def test_an_array_packed_too_tightly_needs_a_limit(tmp_path: Path) -> None:
+    """A few bytes of a file must not fill the memory; a log that hardly changes may be packed."""
+    path = tmp_path / "zeros.mat"
+    savemat(path, {"x": np.zeros(50_000)}, do_compression=True)
+    with pytest.raises(FormatError, match=r"zeros\.mat: an array .* --limit chunk_bytes=4.1e\+05"):
+        list(read_arrays(path, [], {"chunk_bytes": 1e5}))
+    ((_, values),) = read_arrays(path, [], {"chunk_bytes": 1e6})
+    assert values.size == 50_000
+    steps = np.random.default_rng(1).integers(-1, 2, 50_000).cumsum().astype(float)
+    savemat(path, {"x": steps}, do_compression=True)
+    ((_, values),) = read_arrays(path, [], {"chunk_bytes": 1.0})
+    np.testing.assert_array_equal(values[0], steps)
+
+
+def test_a_compressed_array_with_a_wrong_checksum_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "zeros.mat"
+    savemat(path, {"x": np.zeros(50_000)}, do_compression=True)
+    path.write_bytes(path.read_bytes()[:-1] + b"\xff")
+    with pytest.raises(FormatError, match="damaged or cut off"):
+        list(read_arrays(path, []))
