@@ -39,7 +39,7 @@ from gyrostab.units import HOUR
 #: Null records up to this size stay in memory; larger ones are drawn again on each pass.
 MAX_KEPT_NULL_BYTES = 3e8
 #: Band powers of the null records that are drawn and scored together; bounds the memory.
-MAX_BATCH_POWER_BYTES = 6.4e7
+MAX_BATCH_POWER_BYTES = 3.2e7
 #: Fewer records in a batch would spend the time on the loop around them.
 MIN_BATCH_RECORDS = 25
 _RECORDS_PER_CHUNK = 25  # limits memory
