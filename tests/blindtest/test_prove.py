@@ -10,6 +10,7 @@ import shutil
 from pathlib import Path
 from typing import ClassVar
 
+import dask
 import numpy as np
 import pandas as pd
 import pytest
@@ -628,6 +629,7 @@ def test_processes_keep_order_and_use_one_thread():
     assert done == ["1", "1", "1", *map(str, range(5))]
     assert counts == list(range(1, 9))
     assert os.environ.get("OMP_NUM_THREADS") == before
+    assert run_in_processes(dask.config.get, [("num_workers",)], workers=1) == [1]
 
 
 @pytest.mark.slow
