@@ -48,8 +48,9 @@ LIMITS: Mapping[str, tuple[float, str]] = {
 #: Largest plausible ratio of grid samples to rows, and of declared samples to bytes; see `LIMITS`.
 GRID_SAMPLES_PER_ROW = 100
 STORED_SAMPLES_PER_BYTE = 1000
-#: Largest plausible ratio of the bytes of an array to those that it is packed into: deflate reaches
-#: 1032 with equal values, and 10 with values of a gyro that hardly change.
+#: Largest plausible ratio of the bytes of all arrays to those of their file: deflate reaches 1032
+#: with equal values, 400 with a channel that is held for 400 samples, and 5 to 15 with rates that
+#: are rounded to a few steps.
 PACKED_RATIO = 100
 
 
@@ -177,10 +178,10 @@ def check_chunk(
 def check_packed(
     path: Path, packed_bytes: int, unpacked_bytes: int, given: Mapping[str, float] | None = None
 ) -> None:
-    """Refuse a compressed array that needs far more memory than its bytes in the file."""
+    """Refuse a compressed file whose arrays need far more memory than its bytes."""
     if unpacked_bytes > max(limit_value("chunk_bytes", given), PACKED_RATIO * packed_bytes):
         raise FormatError(
-            f"{path.name}: an array of {unpacked_bytes:.4g} bytes is packed into {packed_bytes:,} "
-            "bytes, so that nearly all of its values are equal. If the file is damaged, copy it "
+            f"{path.name}: arrays of {unpacked_bytes:.4g} bytes are packed into {packed_bytes:,} "
+            "bytes, so that nearly all of their values are equal. If the file is damaged, copy it "
             f"again; {describe_limit('chunk_bytes', unpacked_bytes, given)}"
         )

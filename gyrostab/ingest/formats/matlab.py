@@ -314,7 +314,7 @@ def read_arrays(
 def _find_variables(
     file: BinaryIO, order: str, path: Path, limits: Mapping[str, float] | None
 ) -> Iterator[_Elements]:
-    place, size = _HEADER_BYTES, path.stat().st_size
+    place, size, unpacked = _HEADER_BYTES, path.stat().st_size, 0
     while place < size:
         file.seek(place)
         kind, length = struct.unpack(order + "II", file.read(8))
@@ -329,7 +329,8 @@ def _find_variables(
             kind, length = struct.unpack(order + "II", unpacker.decompress(data, 8))
             if kind != _MATRIX:
                 raise ValueError("a compressed element does not hold an array")
-            check_packed(path, len(data), length, limits)
+            unpacked += length
+            check_packed(path, size, unpacked, limits)
             # one more byte, so that the checksum behind the last one is read
             data = unpacker.decompress(unpacker.unconsumed_tail, length + 1)
             if len(data) < length or (len(data) == length and not unpacker.eof):
