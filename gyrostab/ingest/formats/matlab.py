@@ -333,7 +333,7 @@ def _find_variables(
             check_packed(path, size, unpacked, limits)
             # one more byte, so that the checksum behind the last one is read
             data = unpacker.decompress(unpacker.unconsumed_tail, length + 1)
-            if len(data) < length or (len(data) == length and not unpacker.eof):
+            if len(data) < length:
                 raise ValueError(f"a compressed array of {length} bytes is cut off")
             data = data[:length]
         yield _Elements(data, order)
