@@ -90,7 +90,9 @@ def null_scores(
 ) -> NullScores:
     """Collect the scores of null records chunk by chunk, keeping only extreme scores."""
     gathered: dict[str, _ScoreSums] = {}
-    for part_scores in map_in_order(partial(_score, baseline=baseline), _split_records(nulls)):
+    for part_scores in map_in_order(
+        partial(_score_records, baseline=baseline), _split_records(nulls)
+    ):
         for name, scores in part_scores.items():
             if name not in gathered:
                 gathered[name] = _ScoreSums(scores, settings.pooled_records)
@@ -119,7 +121,7 @@ def _split_records(nulls: Iterable[xr.Dataset]) -> Iterator[xr.Dataset]:
             yield chunk.isel(record=slice(first, first + size))
 
 
-def _score(records: xr.Dataset, baseline: xr.Dataset) -> dict[str, xr.Dataset]:
+def _score_records(records: xr.Dataset, baseline: xr.Dataset) -> dict[str, xr.Dataset]:
     """Return the scores of some null records in all statistics that they have, by name."""
     scores = {statistic.name: statistic.score(records, baseline) for statistic in STATISTICS}
     return {name: of_statistic for name, of_statistic in scores.items() if of_statistic is not None}

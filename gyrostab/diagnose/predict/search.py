@@ -56,7 +56,8 @@ def compute_evidence(
     """Compute the evidence of candidates on the recording, or on null records.
 
     Without `count_evidence`, sample counts are left out. `rng` generates the statistics that null
-    records do not have.
+    records do not have: each part of the candidates has a separate generator, so that the result
+    does not depend on the threads that compute the parts.
     """
     trial = Trial(data, state, fold_blocks(state.blocks), count_evidence, rng)
     groups: dict[tuple[object, ...], list[Candidate]] = {}
